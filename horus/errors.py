@@ -1,0 +1,86 @@
+"""Everything horus raises or warns about.
+
+Each message names what was observed, the limit it broke and the remedy, and is
+built here so that one mistake reads the same wherever it is made.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class HorusError(Exception):
+    """Root of every exception that horus raises."""
+
+
+class ConfigError(HorusError, ValueError):
+    """An argument was refused where it was written."""
+
+    def __init__(self, argument: str, value: object, remedy: str) -> None:
+        """Build the message `argument=value: remedy`."""
+        super().__init__(f"{argument}={value!r}: {remedy}")
+        self.argument = argument
+        self.value = value
+        self.remedy = remedy
+
+
+class UnknownNodeError(HorusError, LookupError):
+    """A node was asked for by a name that the scheduler does not have."""
+
+    def __init__(self, name: object, known: list[str]) -> None:
+        """Name the nodes that do exist."""
+        listing = ", ".join(known) if known else "none were added yet"
+        super().__init__(f"no node named {name!r}; the nodes are: {listing}")
+        self.name = name
+
+
+class StateError(HorusError, RuntimeError):
+    """A call came at a time when it cannot be answered."""
+
+
+class TopicError(HorusError, ValueError):
+    """A message or a topic name was refused."""
+
+
+class NodeError(HorusError):
+    """A node's callback failed and its failure policy is `fatal`.
+
+    The original exception is the cause (`__cause__`).
+    """
+
+    def __init__(self, node: str, phase: str, cause: BaseException) -> None:
+        """Name the node, the callback and what it raised."""
+        super().__init__(f"node {node!r}: {phase}() raised {type(cause).__name__}: {cause}")
+        self.node = node
+        self.phase = phase
+
+
+class ShutdownTimeout(HorusError):
+    """A node did not finish its shutdown in the time it is given."""
+
+    def __init__(self, node: str, timeout_s: float) -> None:
+        """Name the node and the limit [s]."""
+        super().__init__(f"node {node!r} did not shut down within {timeout_s:g} s")
+        self.node = node
+        self.timeout_s = timeout_s
+
+
+class HorusWarning(UserWarning):
+    """Root of every warning that horus emits."""
+
+
+class ConfigWarning(HorusWarning):
+    """A configuration that is legal and probably not meant."""
+
+
+class UnavailableWarning(HorusWarning):
+    """A feature was asked for that this version does not provide."""
+
+
+def describe(value: Any, limit: int = 80) -> str:
+    """Return `repr(value)`, shortened, and never failing itself."""
+    try:
+        text = repr(value)
+    except Exception as exc:
+        text = f"<{type(value).__name__} whose repr raised {type(exc).__name__}>"
+    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,0 +1,129 @@
+"""AsyncIo nodes: `async def tick` as tasks on the event loop, never overlapping themselves."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import Future
+
+from horus.executors.base import LoopExecutor
+from horus.live import LiveNode
+from horus.loop.bridge import Bridge
+from horus.loop.cycle import Cycle
+from horus.tick_path import RunTickAsync, build_async_tick
+
+
+class TaskRunner:
+    """Runs async callbacks, one at a time per node, each in a task of the node's context.
+
+    Thread: loop, except `call`.
+    """
+
+    def __init__(self, bridge: Bridge) -> None:
+        """Serve nodes on the bridge's loop."""
+        self._bridge = bridge
+        self._loop = bridge.loop
+        self._ticks: dict[LiveNode, RunTickAsync] = {}
+        self._running: dict[LiveNode, asyncio.Task[None]] = {}
+        self._calls: set[asyncio.Task[None]] = set()
+
+    def adopt(self, live: LiveNode) -> None:
+        """Build the node's tick path."""
+        self._ticks[live] = build_async_tick(live)
+
+    def forget(self, live: LiveNode) -> None:
+        """Forget the node's tick path."""
+        self._ticks.pop(live, None)
+
+    def busy(self, live: LiveNode) -> bool:
+        """Return whether a tick is in progress."""
+        return live in self._running
+
+    def start(self, live: LiveNode, release_ns: int) -> asyncio.Task[None]:
+        """Start a tick; the caller has made sure that none is in progress."""
+        task = self._loop.create_task(
+            self._ticks[live](release_ns),
+            name=f"horus:{live.name}",
+            context=live.context,
+        )
+        self._running[live] = task
+        task.add_done_callback(lambda _: self._running.pop(live, None))
+        return task
+
+    def cancel(self, live: LiveNode) -> None:
+        """Cancel the tick in progress, unless it is the one that calls."""
+        task = self._running.get(live)
+        if task is not None and task is not _current_task():
+            task.cancel()
+
+    def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
+        """Run a callback once the tick in progress has ended.
+
+        Thread: any.
+        """
+        future: Future[bool] = Future()
+
+        def start() -> None:
+            task = self._loop.create_task(
+                self._call(live, phase, future), name=f"horus:{live.name}", context=live.context
+            )
+            self._calls.add(task)
+            task.add_done_callback(self._calls.discard)
+
+        self._bridge.run(start)
+        return future
+
+    async def _call(self, live: LiveNode, phase: str | None, future: Future[bool]) -> None:
+        try:
+            task = self._running.get(live)
+            if task is not None:
+                await asyncio.wait([task])
+            success = True if phase is None else await live.run_phase_async(phase)
+        except BaseException:
+            future.cancel()
+            raise
+        if future.set_running_or_notify_cancel():
+            future.set_result(success)
+
+
+class AsyncIoExecutor(LoopExecutor):
+    """Starts a task per release; a release that finds the node still busy is skipped."""
+
+    def __init__(self, bridge: Bridge, cycle: Cycle) -> None:
+        """Serve the nodes of one run."""
+        super().__init__(bridge, cycle)
+        self._tasks = TaskRunner(bridge)
+
+    def adopt(self, live: LiveNode) -> None:
+        """Build the node's tick path."""
+        self._tasks.adopt(live)
+
+    def engage(self, live: LiveNode) -> None:
+        """Release the node on its grid."""
+        live.enter_service()
+        self._cycle.add(live, self._release)
+
+    def disengage(self, live: LiveNode) -> None:
+        """Release the node no more and cancel its tick in progress: sleeps end at shutdown."""
+        super().disengage(live)
+        self._tasks.cancel(live)
+
+    def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
+        """Run a callback in a task."""
+        return self._tasks.call(live, phase)
+
+    def dismiss(self, live: LiveNode) -> None:
+        """Forget the node."""
+        self._tasks.forget(live)
+
+    def _release(self, live: LiveNode, release_ns: int) -> None:
+        if self._tasks.busy(live):
+            live.counters.skipped += 1
+        else:
+            self._tasks.start(live, release_ns)
+
+
+def _current_task() -> asyncio.Task[object] | None:
+    try:
+        return asyncio.current_task()
+    except RuntimeError:
+        return None

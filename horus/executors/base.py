@@ -1,0 +1,57 @@
+"""What executors have in common."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+
+from horus.live import LiveNode
+from horus.loop.bridge import Bridge
+from horus.loop.cycle import Cycle
+
+
+def run_into(future: Future[bool], live: LiveNode, phase: str | None) -> None:
+    """Run a plain node's callback and put its success into `future`."""
+    if future.set_running_or_notify_cancel():
+        future.set_result(True if phase is None else live.run_phase(phase))
+
+
+class LoopExecutor:
+    """Base of the executors whose nodes live on the event loop's thread."""
+
+    def __init__(self, bridge: Bridge, cycle: Cycle) -> None:
+        """Serve the nodes of one run."""
+        self._bridge = bridge
+        self._loop = bridge.loop
+        self._cycle = cycle
+
+    def is_home(self, live: LiveNode) -> bool:
+        """Return whether the calling thread is the event loop's."""
+        return self._bridge.on_loop_thread()
+
+    def retime(self, live: LiveNode) -> None:
+        """Move the node to the grid of its new rate."""
+        self._cycle.retime(live)
+
+    def disengage(self, live: LiveNode) -> None:
+        """Release the node no more."""
+        live.leave_service()
+        self._cycle.remove(live)
+
+    def dismiss(self, live: LiveNode) -> None:
+        """Do nothing: the loop's thread is not this executor's to end."""
+
+    def call_plain(self, live: LiveNode, phase: str | None) -> Future[bool]:
+        """Run a plain callback on the loop: now, or when its thread is free."""
+        future: Future[bool] = Future()
+
+        def run() -> None:
+            run_into(future, live, phase)
+
+        if not self._bridge.on_loop_thread():
+            self._bridge.post(run)
+        elif live.running_since_ns:
+            # The node's own tick is on the stack below us.
+            self._loop.call_soon(run)
+        else:
+            run()
+        return future

@@ -1,0 +1,66 @@
+"""Compute nodes: CPU-heavy ticks on worker threads, released by the event loop.
+
+The pool has a thread for every compute node, so that a slow node delays no
+other, and a node finds itself on the same thread at every tick.
+"""
+
+from __future__ import annotations
+
+import functools
+
+from horus.executors.thread import NodeThread, ThreadExecutor
+from horus.live import LiveNode
+from horus.loop.cycle import Cycle
+from horus.tick_path import build_tick
+
+
+class ComputeThread(NodeThread):
+    """Runs a tick when told to."""
+
+    def __init__(self, live: LiveNode) -> None:
+        """Prepare an idle worker."""
+        super().__init__(live)
+        self.busy = False
+        self._run_tick = build_tick(live)
+
+    def tick(self, release_ns: int) -> None:
+        """Run the tick of a release."""
+        try:
+            self._run_tick(release_ns)
+        finally:
+            self.busy = False
+
+
+class ComputeExecutor(ThreadExecutor[ComputeThread]):
+    """Hands each release to the node's worker; one that finds it busy is skipped."""
+
+    def __init__(self, cycle: Cycle) -> None:
+        """Serve the nodes of one run."""
+        super().__init__()
+        self._cycle = cycle
+
+    def make_thread(self, live: LiveNode) -> ComputeThread:
+        """Return the node's thread, not started."""
+        return ComputeThread(live)
+
+    def engage(self, live: LiveNode) -> None:
+        """Release the node on its grid."""
+        live.enter_service()
+        self._cycle.add(live, self._release)
+
+    def disengage(self, live: LiveNode) -> None:
+        """Release the node no more."""
+        live.leave_service()
+        self._cycle.remove(live)
+
+    def retime(self, live: LiveNode) -> None:
+        """Move the node to the grid of its new rate."""
+        self._cycle.retime(live)
+
+    def _release(self, live: LiveNode, release_ns: int) -> None:
+        thread = self.thread_of(live)
+        if thread.busy:
+            live.counters.skipped += 1
+            return
+        thread.busy = True
+        thread.post(functools.partial(thread.tick, release_ns))

@@ -1,0 +1,117 @@
+"""Event nodes: one tick per message of their trigger topic, first in, first out."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+
+from horus.executors.async_io import TaskRunner
+from horus.executors.base import LoopExecutor
+from horus.live import LiveNode
+from horus.loop.bridge import Bridge
+from horus.loop.cycle import Cycle
+from horus.tick_path import RunTick, build_tick
+from horus.units import to_s
+
+
+class EventExecutor(LoopExecutor):
+    """Wakes a node when its trigger topic receives a message."""
+
+    def __init__(self, bridge: Bridge, cycle: Cycle) -> None:
+        """Serve the nodes of one run."""
+        super().__init__(bridge, cycle)
+        self._tasks = TaskRunner(bridge)
+        self._runners: dict[LiveNode, _EventRunner] = {}
+
+    def adopt(self, live: LiveNode) -> None:
+        """Build the node's tick path."""
+        if live.node.is_async:
+            self._tasks.adopt(live)
+            self._runners[live] = _EventRunner(live, self._bridge, None, self._tasks)
+        else:
+            self._runners[live] = _EventRunner(live, self._bridge, build_tick(live), self._tasks)
+
+    def engage(self, live: LiveNode) -> None:
+        """Listen to the trigger topic, starting with what has arrived already."""
+        live.enter_service()
+        self._runners[live].listen()
+
+    def disengage(self, live: LiveNode) -> None:
+        """Stop listening; an async tick in progress is cancelled."""
+        super().disengage(live)
+        self._runners[live].ignore()
+        self._tasks.cancel(live)
+
+    def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
+        """Run a callback on the loop's thread."""
+        if live.node.is_async:
+            return self._tasks.call(live, phase)
+        return self.call_plain(live, phase)
+
+    def dismiss(self, live: LiveNode) -> None:
+        """Forget the node."""
+        self._runners.pop(live, None)
+        self._tasks.forget(live)
+
+
+class _EventRunner:
+    """Turns messages into ticks of one node.
+
+    Thread: loop, except `wake`, which senders call on theirs.
+    """
+
+    def __init__(
+        self, live: LiveNode, bridge: Bridge, run_tick: RunTick | None, tasks: TaskRunner
+    ) -> None:
+        trigger = live.trigger
+        assert trigger is not None
+        self._live = live
+        self._trigger = trigger
+        self._bridge = bridge
+        self._run_tick = run_tick
+        self._tasks = tasks
+        self._scheduled = False
+        self._woken_ns = 0
+        self._now_ns = live.timeline.now_ns
+
+    def listen(self) -> None:
+        self._trigger.wake = self.wake
+        if self._trigger.queue:
+            self.wake()
+
+    def ignore(self) -> None:
+        self._trigger.wake = None
+
+    def wake(self) -> None:
+        """Schedule a tick, unless one is scheduled already. Thread: any."""
+        if not self._scheduled:
+            self._scheduled = True
+            self._woken_ns = self._now_ns()
+            if self._bridge.on_loop_thread():
+                self._bridge.loop.call_soon(self._step)
+            else:
+                self._bridge.post(self._step)
+
+    def _step(self) -> None:
+        """Tick once; if more messages wait, come back after the loop's other work."""
+        self._scheduled = False
+        live = self._live
+        if live.retired or not self._trigger.queue or self._tasks.busy(live):
+            return
+        delay_ns = live.resume_after_ns()
+        if delay_ns:
+            # Restarting: the messages wait, and are not lost to the back-off.
+            self._scheduled = True
+            self._bridge.loop.call_later(to_s(delay_ns), self._step)
+            return
+        received = self._trigger.received
+        if self._run_tick is None:
+            task = self._tasks.start(live, self._woken_ns)
+            task.add_done_callback(lambda _: self._ticked(received))
+        else:
+            self._run_tick(self._woken_ns)
+            self._ticked(received)
+
+    def _ticked(self, received: int) -> None:
+        self._trigger.consume_one_since(received)
+        if self._trigger.queue and not self._live.retired:
+            self.wake()

@@ -1,0 +1,120 @@
+"""A thread that is the home of one node."""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Generic, TypeVar
+
+from horus.executors.base import run_into
+from horus.live import LiveNode
+from horus.units import to_s
+
+T = TypeVar("T", bound="NodeThread")
+
+_LAST_STEPS_S = 1.0
+"""How long a thread may take to return once it has nothing left to do [s]."""
+
+
+class NodeThread(threading.Thread):
+    """Runs jobs one at a time, and whatever `idle` does in between.
+
+    A node's `init`, ticks and `shutdown` all run here, so that what a driver
+    opens in one of them works in the others. A daemon: a node that never
+    returns must not keep the process from ending.
+
+    Thread: any for `post`, `call` and `close`; the others are the thread's own.
+    """
+
+    def __init__(self, live: LiveNode) -> None:
+        """Prepare a thread for `live`; it runs from `start()` on."""
+        super().__init__(name=f"horus:{live.name}", daemon=True)
+        self.live = live
+        self._jobs: deque[Callable[[], None]] = deque()
+        self._closing = False
+        # A lock as a binary semaphore. Waiting for it with a timeout sleeps as
+        # exactly as clock_nanosleep (sem_clockwait on CLOCK_MONOTONIC), and,
+        # unlike a sleep, ends when there is something to do.
+        self._parked = threading.Lock()
+        self._parked.acquire()
+
+    def post(self, job: Callable[[], None]) -> None:
+        """Run `job` after what is in progress."""
+        self._jobs.append(job)
+        self.unpark()
+
+    def call(self, phase: str | None) -> Future[bool]:
+        """Run one of the node's callbacks; the result tells whether it succeeded."""
+        future: Future[bool] = Future()
+        self.post(lambda: run_into(future, self.live, phase))
+        return future
+
+    def close(self) -> None:
+        """End the thread once its jobs are done."""
+        self._closing = True
+        self.unpark()
+
+    def unpark(self) -> None:
+        """Wake the thread, or keep it from parking the next time."""
+        try:
+            self._parked.release()
+        except RuntimeError:
+            pass  # woken already
+
+    def park(self, timeout_ns: int | None = None) -> None:
+        """Sleep until woken, for at most `timeout_ns` [ns]."""
+        self._parked.acquire(True, -1 if timeout_ns is None else to_s(timeout_ns))
+
+    def run(self) -> None:
+        """Serve until closed."""
+        while True:
+            if self._jobs:
+                self._jobs.popleft()()
+            elif self._closing:
+                return
+            else:
+                self.idle()
+
+    def idle(self) -> None:
+        """Do what is to be done when there is no job."""
+        self.park()
+
+
+class ThreadExecutor(ABC, Generic[T]):
+    """Base of the executors that give each node a thread."""
+
+    def __init__(self) -> None:
+        """Begin with no threads."""
+        self._threads: dict[LiveNode, T] = {}
+
+    @abstractmethod
+    def make_thread(self, live: LiveNode) -> T:
+        """Return the node's thread, not started."""
+
+    def thread_of(self, live: LiveNode) -> T:
+        """Return the node's thread."""
+        return self._threads[live]
+
+    def adopt(self, live: LiveNode) -> None:
+        """Start the node's thread; it does nothing yet."""
+        thread = self._threads[live] = self.make_thread(live)
+        thread.start()
+
+    def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
+        """Run a callback on the node's thread after what is in progress."""
+        return self._threads[live].call(phase)
+
+    def is_home(self, live: LiveNode) -> bool:
+        """Return whether the calling thread is the node's."""
+        return threading.current_thread() is self._threads.get(live)
+
+    def dismiss(self, live: LiveNode) -> None:
+        """End the node's thread; one that is stuck in a tick stays behind."""
+        thread = self._threads.pop(live, None)
+        if thread is not None:
+            thread.close()
+            if thread is not threading.current_thread() and not live.running_since_ns:
+                thread.join(_LAST_STEPS_S)

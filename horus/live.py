@@ -1,0 +1,364 @@
+"""`LiveNode`: one node inside one scheduler, with everything that changes as it runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import inspect
+import logging
+from collections.abc import Awaitable
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Any, Protocol
+
+from horus import clock
+from horus.clock import TickContext, Timeline
+from horus.errors import NodeError
+from horus.spec import ExecutionClass, FailurePolicy, Health, NodeSpec, NodeState
+from horus.stats import NodeCounters, NodeTiming
+from horus.timing import ReleaseGrid
+from horus.units import NS_PER_MS, NS_PER_S, readable, to_s
+
+if TYPE_CHECKING:
+    from horus.node import Node
+    from horus.topics import Subscription
+
+NO_LIMIT_NS = 1 << 62
+FIRST_BACKOFF_NS = 100 * NS_PER_MS
+LONGEST_BACKOFF_NS = 5 * NS_PER_S
+
+
+class Control(Protocol):
+    """What a node may ask of the scheduler that runs it.
+
+    Thread: any.
+    """
+
+    def request_stop(self, reason: str) -> None:
+        """Stop in order."""
+
+    def fail(self, error: NodeError) -> None:
+        """Stop in order, then raise `error` from `run()`."""
+
+    def count_miss(self) -> None:
+        """Take note that a deadline was missed."""
+
+
+class Admission(Enum):
+    """Whether a released node may tick."""
+
+    TICK = auto()
+    SKIP = auto()
+    RESTART = auto()
+    """Run `init()` again first."""
+
+
+class LiveNode:
+    """A node's run-time state.
+
+    Thread: written by the thread that runs the node's callbacks; others read
+    single attributes, or set `gated` and `retired`, which are only ever looked at.
+    """
+
+    def __init__(self, node: Node, timeline: Timeline, control: Control, sequence: int) -> None:
+        """Put `node` into service as the `sequence`-th node added."""
+        self.node = node
+        self.control = control
+        self.timeline = timeline
+        self.sequence = sequence
+        self.counters = NodeCounters()
+        self.state = NodeState.UNINITIALIZED
+        self.health = Health.HEALTHY
+        self.trigger: Subscription | None = None
+        self.publishes = frozenset(pub.topic for pub in node.pubs)
+        self.subscribes = frozenset(sub.topic for sub in node.subs)
+        self.tick_context = TickContext(node.name, timeline)
+        self.context = contextvars.copy_context()
+        self.context.run(clock.current.set, self.tick_context)
+        self.gated = False
+        """Whether a release must be admitted (`admit`) before it ticks."""
+        self.retired = False
+        """Whether the node is leaving: it never ticks again."""
+        self.skip_next = False
+        self.in_episode = False
+        self.running_since_ns = 0
+        """Start of the tick in progress [ns]; 0 between ticks."""
+        self.callbacks = {
+            phase: node.callback(phase) for phase in ("init", "tick", "shutdown", "safe_state")
+        }
+        self._hooks: set[asyncio.Future[None]] = set()
+        self._restart_at_ns = 0
+        self._backoff_ns = FIRST_BACKOFF_NS
+        self._error_log = _Limiter()
+        self._limit_log = _Limiter()
+        self.apply(node.spec)
+
+    # -- what it is --------------------------------------------------------------
+
+    @property
+    def name(self) -> str:
+        """The node's name."""
+        return self.spec.name
+
+    @property
+    def order(self) -> int:
+        """The node's execution order."""
+        return self.spec.order
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """The place in execution order: (order, insertion)."""
+        return (self.spec.order, self.sequence)
+
+    @property
+    def initialized(self) -> bool:
+        """Whether `init()` has succeeded and `shutdown()` has not run."""
+        return self.state in (NodeState.RUNNING, NodeState.RESTARTING)
+
+    def apply(self, spec: NodeSpec) -> None:
+        """Take over a configuration: rate and limits hold from the next tick on."""
+        self.spec = spec
+        self.period_ns = spec.period_ns
+        self.budget_ns = NO_LIMIT_NS if spec.budget_ns is None else spec.budget_ns
+        self.deadline_ns = NO_LIMIT_NS if spec.deadline_ns is None else spec.deadline_ns
+        context = self.tick_context
+        context.budget_ns = spec.budget_ns
+        context.nominal_dt_s = 1.0 / spec.rate_hz
+        if self.timeline.deterministic and spec.execution_class is not ExecutionClass.EVENT:
+            context.fixed_dt_s = context.nominal_dt_s
+
+    def grid(self) -> ReleaseGrid:
+        """Return the node's release grid: every node counts from the same epoch."""
+        return ReleaseGrid(self.timeline.epoch_ns, self.spec.rate_hz)
+
+    # -- callbacks ---------------------------------------------------------------
+
+    def call(self, phase: str) -> Any:
+        """Run a callback in the node's context; an async one returns its coroutine."""
+        callback = self.callbacks[phase]
+        if callback is None:
+            return None
+        if clock.current.get() is self.tick_context:
+            return callback()
+        return self.context.run(callback)
+
+    def run_phase(self, phase: str) -> bool:
+        """Run a plain callback; return whether it succeeded. Never raises."""
+        error = None
+        try:
+            self.call(phase)
+        except BaseException as exc:
+            error = exc
+        return self._phase_ended(phase, error)
+
+    async def run_phase_async(self, phase: str) -> bool:
+        """Run a callback of either kind; return whether it succeeded."""
+        error = None
+        try:
+            result = self.call(phase)
+            if inspect.isawaitable(result):
+                await result
+        except Exception as exc:
+            error = exc
+        return self._phase_ended(phase, error)
+
+    def _phase_ended(self, phase: str, error: BaseException | None) -> bool:
+        if error is not None:
+            self.phase_failed(phase, error)
+        if phase == "init" and self.state is NodeState.UNINITIALIZED:
+            self._initialized_with(error is None)
+        return error is None
+
+    def enter_safe_state(self) -> None:
+        """Call the safe-state hook, where the node's ticks run.
+
+        Thread: the node's own.
+        """
+        result = None
+        try:
+            result = self.call("safe_state")
+        except Exception as exc:
+            self.phase_failed("safe_state", exc)
+        if inspect.iscoroutine(result):
+            # Only async nodes have an async hook, and their ticks run on a loop.
+            task = asyncio.ensure_future(self._await_safe_state(result))
+            self._hooks.add(task)
+            task.add_done_callback(self._hooks.discard)
+
+    async def _await_safe_state(self, hook: Awaitable[Any]) -> None:
+        try:
+            await hook
+        except Exception as exc:
+            self.phase_failed("safe_state", exc)
+
+    def phase_failed(self, phase: str, exc: BaseException) -> None:
+        """Count, log and report an exception from `init`, `shutdown` or `safe_state`."""
+        self.counters.errors += 1
+        self.emit(logging.ERROR, f"{phase}() raised {type(exc).__name__}: {exc}", exc)
+        self.notify_error(exc)
+
+    def notify_error(self, exc: BaseException) -> None:
+        """Tell `on_error`; what it raises itself is logged and goes no further."""
+        if self.node.on_error is None:
+            return
+        try:
+            self.node.on_error(self.node, exc)
+        except Exception as second:
+            self.emit(logging.ERROR, f"on_error() raised {type(second).__name__}: {second}", second)
+
+    def emit(self, level: int, message: str, exc: BaseException | None = None) -> None:
+        """Log on the node's behalf."""
+        extra = {"node": self.name, "cycle": self.tick_context.cycle()}
+        self.node.log.log(level, "%s", message, exc_info=exc, extra=extra)
+
+    # -- life cycle --------------------------------------------------------------
+
+    def _initialized_with(self, success: bool) -> None:
+        self.state = NodeState.RUNNING if success else NodeState.ERROR
+        self.regate()
+        if not success:
+            self.emit(logging.ERROR, "excluded from ticking, because init() failed")
+
+    def renew(self) -> None:
+        """Get ready for another `init()`: a new run begins."""
+        if not self.initialized:
+            self.state = NodeState.UNINITIALIZED
+            self.skip_next = self.in_episode = False
+            self.tick_context.start_ns = self.tick_context.previous_ns = clock.NEVER
+
+    def stopped(self) -> None:
+        """Enter the state that follows `shutdown()`."""
+        self.state = NodeState.STOPPED
+        self.gated = True
+
+    def regate(self) -> None:
+        """Close or open the gate as the state demands."""
+        self.gated = self.retired or self.skip_next or self.state is not NodeState.RUNNING
+
+    def enter_service(self) -> None:
+        """Tick when released, from now on."""
+        self.retired = False
+        self.regate()
+
+    def leave_service(self) -> None:
+        """Begin no further tick."""
+        self.retired = self.gated = True
+
+    def admit(self) -> Admission:
+        """Decide whether a release of a gated node may tick."""
+        if self.retired:
+            return Admission.SKIP
+        if self.state is NodeState.RESTARTING:
+            waited = self.timeline.now_ns() >= self._restart_at_ns
+            return Admission.RESTART if waited else Admission.SKIP
+        if self.skip_next:
+            self.skip_next = False
+            self.regate()
+            return Admission.SKIP
+        return Admission.TICK if self.state is NodeState.RUNNING else Admission.SKIP
+
+    def resume_after_ns(self) -> int:
+        """Return how long a restarting node waits before `init()` runs again [ns]."""
+        if self.state is not NodeState.RESTARTING:
+            return 0
+        return max(0, self._restart_at_ns - self.timeline.now_ns())
+
+    def plan_restart(self) -> None:
+        """Wait for the back-off, which doubles while the node keeps failing."""
+        now_ns = self.timeline.now_ns()
+        if now_ns - self._restart_at_ns > LONGEST_BACKOFF_NS:
+            self._backoff_ns = FIRST_BACKOFF_NS
+        self._restart_at_ns = now_ns + self._backoff_ns
+        self.state = NodeState.RESTARTING
+        self.gated = True
+        self.emit(logging.WARNING, f"restarts in {readable(self._backoff_ns)}")
+        self._backoff_ns = min(2 * self._backoff_ns, LONGEST_BACKOFF_NS)
+
+    def restarted(self, success: bool) -> None:
+        """Resume after `init()` ran again, or wait for the next attempt."""
+        if success:
+            self.counters.restarts += 1
+            self.state = NodeState.RUNNING
+            self.regate()
+            self.emit(logging.INFO, "restarted")
+        else:
+            self.plan_restart()
+
+    # -- trouble -----------------------------------------------------------------
+
+    def tick_failed(self, exc: BaseException) -> None:
+        """Count, log (at most once a second) and report an exception from `tick`."""
+        self.counters.errors += 1
+        due, others, _ = self._error_log.note(self.timeline.now_ns(), 0)
+        if due:
+            policy = self.spec.failure_policy
+            quiet = policy is FailurePolicy.SKIP
+            more = f" ({others} more since the last message)" if others else ""
+            self.emit(
+                logging.WARNING if quiet else logging.ERROR,
+                f"tick() raised {type(exc).__name__}: {exc}{more}",
+                exc if policy is None else None,
+            )
+        self.notify_error(exc)
+
+    def limit_exceeded(self, over_budget_ns: int, past_deadline_ns: int) -> str:
+        """Log an exceeded limit (at most once a second); return its description."""
+        if past_deadline_ns > 0:
+            over_ns, kind, limit_ns = past_deadline_ns, "deadline", self.deadline_ns
+        else:
+            over_ns, kind, limit_ns = over_budget_ns, "budget", self.budget_ns
+        text = f"exceeded its {kind} of {readable(limit_ns)} by {readable(over_ns)}"
+        due, others, worst_ns = self._limit_log.note(self.timeline.now_ns(), over_ns)
+        if due and others:
+            self.emit(
+                logging.WARNING,
+                f"{others + 1} ticks exceeded their limits since the last message, "
+                f"worst {readable(worst_ns)} over",
+            )
+        elif due:
+            self.emit(logging.WARNING, text)
+        return text
+
+    # -- reports -----------------------------------------------------------------
+
+    def timing(self, now_ns: int) -> NodeTiming:
+        """Return the node's row of the timing report; `now_ns` is 0 when nothing runs."""
+        counters = self.counters
+        execution, latency = counters.execution, counters.start_latency
+        event = self.spec.execution_class is ExecutionClass.EVENT
+        return NodeTiming(
+            name=self.name,
+            execution_class=self.spec.execution_class.value,
+            rate_hz=None if event else self.spec.rate_hz,
+            achieved_hz=counters.achieved_hz(0 if event else self.period_ns, now_ns),
+            ticks=counters.ticks,
+            execution_avg_s=execution.mean_s(),
+            execution_p99_s=execution.quantile_s(0.99),
+            execution_max_s=to_s(execution.max_ns),
+            start_latency_avg_s=latency.mean_s(),
+            start_latency_p99_s=latency.quantile_s(0.99),
+            start_latency_max_s=to_s(latency.max_ns),
+            budget_overruns=counters.budget_overruns,
+            deadline_misses=counters.deadline_misses,
+            skipped=counters.skipped,
+            errors=counters.errors,
+        )
+
+
+class _Limiter:
+    """Lets one message a second through and counts the others."""
+
+    def __init__(self) -> None:
+        self._next_ns: int | None = None
+        self._held_back = 0
+        self._worst = 0
+
+    def note(self, now_ns: int, size: int) -> tuple[bool, int, int]:
+        """Return (whether to log now, how many were held back, the worst size)."""
+        self._worst = max(self._worst, size)
+        if self._next_ns is not None and now_ns < self._next_ns:
+            self._held_back += 1
+            return False, self._held_back, self._worst
+        held_back, worst = self._held_back, self._worst
+        self._next_ns = now_ns + NS_PER_S
+        self._held_back = self._worst = 0
+        return True, held_back, worst

@@ -1,0 +1,69 @@
+"""Logs that a person sees without configuring anything, and that never make a tick wait."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import logging.handlers
+import queue
+import sys
+from collections.abc import Iterator
+
+_root = logging.getLogger("horus")
+
+
+@contextlib.contextmanager
+def visible(*, install: bool, verbose: bool) -> Iterator[None]:
+    """Show horus' log on stderr while the block runs, unless logging is configured.
+
+    Records go through a queue to a thread that writes them: a slow terminal
+    costs the tick that logs nothing.
+
+    Args:
+        install: Whether a handler may be installed at all.
+        verbose: Whether debug messages are shown; otherwise from info on.
+    """
+    level = _root.level
+    if verbose:
+        _root.setLevel(logging.DEBUG)
+    elif install and level == logging.NOTSET:
+        _root.setLevel(logging.INFO)
+    try:
+        if install and not _root.hasHandlers():
+            with _stderr_handler():
+                yield
+        else:
+            yield
+    finally:
+        _root.setLevel(level)
+
+
+@contextlib.contextmanager
+def _stderr_handler() -> Iterator[None]:
+    records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
+    screen = logging.StreamHandler(sys.stderr)
+    screen.setFormatter(_Formatter())
+    writer = logging.handlers.QueueListener(records, screen)
+    handler = logging.handlers.QueueHandler(records)
+    _root.addHandler(handler)
+    writer.start()
+    try:
+        yield
+    finally:
+        _root.removeHandler(handler)
+        writer.stop()
+
+
+class _Formatter(logging.Formatter):
+    """`12:34:56.789 WARNING motor @1234: message`."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """Put a record on one line; exceptions follow below."""
+        time_of_day = self.formatTime(record, "%H:%M:%S")
+        source = record.name.removeprefix("horus.node.").removeprefix("horus.")
+        cycle = getattr(record, "cycle", None)
+        where = source if cycle is None else f"{source} @{cycle}"
+        return (
+            f"{time_of_day}.{int(record.msecs):03d} {record.levelname:<7} {where}: "
+            f"{record.getMessage()}"
+        )

@@ -1,0 +1,1 @@
+"""The run loop: releases, wake-ups, supervision and shutdown of one run."""

@@ -1,0 +1,73 @@
+"""The main loop: release whatever is due, in order, then sleep until the next release."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from horus.clock import Timeline
+from horus.live import LiveNode
+from horus.loop.releases import ReleaseQueue
+from horus.loop.ticker import Ticker
+
+Dispatch = Callable[[LiveNode, int], None]
+"""Starts a tick of a node for a release [ns]: inline, as a task, or on another thread."""
+
+
+class Cycle:
+    """Releases the nodes that are driven by the event loop.
+
+    `run_due` is the main loop's body, woken by the ticker at the earliest
+    release and never in between::
+
+        while a release is due, the earliest first, ties in execution order:
+            dispatch it (BestEffort nodes tick here and now; others are started)
+            queue the node's next release
+        arm the ticker for the earliest release
+
+    What becomes due meanwhile waits for the next turn, so that the loop's other
+    work gets one in between.
+
+    Thread: loop.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, timeline: Timeline) -> None:
+        """Begin with no nodes."""
+        self._now_ns = timeline.now_ns
+        self._releases = ReleaseQueue()
+        self._dispatch: dict[LiveNode, Dispatch] = {}
+        self._ticker = Ticker(loop, self.run_due)
+
+    def run_due(self) -> None:
+        """Dispatch every release that is due; see the class for the steps."""
+        now_ns = self._now_ns()
+        while (due := self._releases.pop_due(now_ns)) is not None:
+            live, release_ns = due
+            self._dispatch[live](live, release_ns)
+        self._arm()
+
+    def add(self, live: LiveNode, dispatch: Dispatch) -> None:
+        """Release `live` on its grid from now on."""
+        self._dispatch[live] = dispatch
+        self._releases.add(live, live.rank, self._now_ns())
+        self._arm()
+
+    def remove(self, live: LiveNode) -> None:
+        """Release `live` no more; unknown nodes are ignored."""
+        self._releases.remove(live)
+        self._dispatch.pop(live, None)
+
+    def retime(self, live: LiveNode) -> None:
+        """Move `live` to the grid of its new rate."""
+        self._releases.retime(live, self._now_ns())
+        self._arm()
+
+    def close(self) -> None:
+        """Release nothing more."""
+        self._releases.clear()
+        self._ticker.close()
+
+    def _arm(self) -> None:
+        next_ns = self._releases.next_ns
+        if next_ns is not None:
+            self._ticker.arm(next_ns)

@@ -1,0 +1,64 @@
+"""What the run loop knows of an executor: a home for the nodes of one class."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from typing import Protocol
+
+from horus.live import LiveNode
+
+
+class Executor(Protocol):
+    """Runs the callbacks of its nodes, each node's one at a time, in the node's home.
+
+    The home is a thread: the event loop's for BestEffort, Event and AsyncIo
+    nodes, a thread of the node's own for Rt and Compute. A node goes through
+    `adopt`, `call("init")`, `engage`, ticks, `disengage`, `call("shutdown")`,
+    `dismiss`, in this order.
+    """
+
+    def adopt(self, live: LiveNode) -> None:
+        """Give the node a home.
+
+        Thread: loop.
+        """
+
+    def engage(self, live: LiveNode) -> None:
+        """Let ticks begin.
+
+        Thread: loop.
+        """
+
+    def disengage(self, live: LiveNode) -> None:
+        """Let no further tick begin; a tick in progress goes on.
+
+        Thread: loop.
+        """
+
+    def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
+        """Run a callback in the node's home once no tick is in progress.
+
+        The result tells whether it succeeded; the future never holds an
+        exception of the callback. None runs nothing: the future is done when
+        the home is free.
+
+        Thread: any.
+        """
+
+    def retime(self, live: LiveNode) -> None:
+        """Adopt the node's changed rate.
+
+        Thread: loop.
+        """
+
+    def is_home(self, live: LiveNode) -> bool:
+        """Return whether the calling thread is the node's home.
+
+        Thread: any.
+        """
+
+    def dismiss(self, live: LiveNode) -> None:
+        """Take the home away.
+
+        Thread: loop.
+        """

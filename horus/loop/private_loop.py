@@ -1,0 +1,174 @@
+"""Event loops that are stepped from plain code: for `tick_once` and for virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import selectors
+from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+from horus.clock import SimClock
+from horus.units import to_ns, to_s
+
+T = TypeVar("T")
+
+_LAST_STEPS_S = 1.0
+"""How long cancelled tasks may take to end when a loop is closed [s]."""
+
+_IO_PATIENCE_S = 0.02
+"""How long virtual time stands still for sockets to answer, in real time [s]."""
+
+
+class StepLoop:
+    """An event loop of our own that a plain function can run for a while.
+
+    A thread runs one event loop at a time. Called where one is running already
+    (`sched.tick_once()` in an async test), the steps are taken on a helper
+    thread while the caller waits.
+
+    Thread: one at a time.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Take over `loop`, which must not be running."""
+        self.loop = loop
+        self._helper: ThreadPoolExecutor | None = None
+
+    def run(self, work: Coroutine[Any, Any, T], context: contextvars.Context) -> T:
+        """Run a coroutine to its end and return its result."""
+        task = self.loop.create_task(work, context=context)
+        self.step(lambda: self.loop.run_until_complete(task))
+        return task.result()
+
+    def step(self, run: Callable[[], object]) -> None:
+        """Call something that runs the loop."""
+        if asyncio._get_running_loop() is None:
+            run()
+            return
+        if self._helper is None:
+            self._helper = ThreadPoolExecutor(1, thread_name_prefix="horus-step")
+        self._helper.submit(run).result()
+
+    def finish(self, tasks: set[asyncio.Task[Any]]) -> None:
+        """Let cancelled tasks end; one that refuses is left alone after a while."""
+        self.loop.run_until_complete(asyncio.wait(tasks, timeout=_LAST_STEPS_S))
+
+    def close(self) -> None:
+        """Cancel what is left and close the loop."""
+
+        def end() -> None:
+            tasks = asyncio.all_tasks(self.loop)
+            for task in tasks:
+                task.cancel()
+            if tasks:
+                self.finish(tasks)
+            self.loop.run_until_complete(self.loop.shutdown_asyncgens())
+            self.loop.close()
+
+        self.step(end)
+        if self._helper is not None:
+            self._helper.shutdown()
+
+
+class VirtualLoop(StepLoop):
+    """An event loop on simulated time: `asyncio.sleep(60)` ends when the clock says so.
+
+    Timers follow the simulation's clock. Work handed to threads runs at once,
+    inline. Sockets are real: while a tick waits for one, virtual time stands
+    still for a moment, so that a server on this machine answers within the
+    instant of the question.
+    """
+
+    def __init__(self, clock: SimClock) -> None:
+        """Create a loop on `clock`."""
+        self._clock = clock
+        self._next_timer_ns: int | None = None
+        self._selector = _IdleSelector()
+        super().__init__(_SimulatedLoop(clock, self._selector))
+        self._selector.when_idle = self.loop.stop
+
+    @property
+    def next_timer_ns(self) -> int | None:
+        """The instant of the earliest timer [ns]; None when nothing waits for time."""
+        return self._next_timer_ns
+
+    def settle(self) -> None:
+        """Run until nothing can go on without time passing."""
+        self.step(self.loop.run_forever)
+        idle_s = self._selector.idle_s
+        # At least 1 ns ahead: a timer a rounding error away must not stop time.
+        self._next_timer_ns = (
+            None if idle_s is None else self._clock.now_ns() + max(1, to_ns(idle_s))
+        )
+
+    def finish(self, tasks: set[asyncio.Task[Any]]) -> None:
+        """Let cancelled tasks end, as far as they do without time passing."""
+        self.loop.run_forever()
+
+    def run(self, work: Coroutine[Any, Any, T], context: contextvars.Context) -> T:
+        """Run a coroutine to its end, moving the clock from timer to timer."""
+        task = self.loop.create_task(work, context=context)
+        self.settle()
+        while not task.done():
+            if self._next_timer_ns is None:
+                task.cancel()
+            else:
+                self._clock.advance_to(self._next_timer_ns)
+            self.settle()
+        return task.result()
+
+
+class _SimulatedLoop(asyncio.SelectorEventLoop):
+    """asyncio's own loop with another clock and no threads."""
+
+    def __init__(self, clock: SimClock, selector: selectors.BaseSelector) -> None:
+        self._simulated = clock
+        super().__init__(selector)
+
+    def time(self) -> float:
+        return to_s(self._simulated.now_ns())
+
+    def run_in_executor(  # type: ignore[override]
+        self, executor: object, func: Callable[..., T], *args: Any
+    ) -> asyncio.Future[T]:
+        """Call `func` here and now: a thread would finish when it likes."""
+        future: asyncio.Future[T] = self.create_future()
+        try:
+            future.set_result(func(*args))
+        except Exception as exc:
+            future.set_exception(exc)
+        return future
+
+
+class _IdleSelector(selectors.DefaultSelector):
+    """A selector that stops the loop where it would wait."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.when_idle: Callable[[], None] = lambda: None
+        self.idle_s: float | None = None
+        """How long the loop would have slept [s]; None for ever."""
+        self._has_progressed = False
+
+    def select(self, timeout: float | None = None) -> list[Any]:
+        events = super().select(0)
+        if events or timeout == 0:
+            self._has_progressed = True
+            return events
+        if self._has_progressed and self._watches_sockets():
+            # Once per standstill: a connection that is merely kept open must not
+            # cost every simulated millisecond a real wait.
+            self._has_progressed = False
+            events = super().select(_IO_PATIENCE_S)
+            if events:
+                self._has_progressed = True
+                return events
+        self.idle_s = timeout
+        self.when_idle()
+        return []
+
+    def _watches_sockets(self) -> bool:
+        """Return whether anything but the loop's own wake-up pipe is registered."""
+        return len(self.get_map()) > 1

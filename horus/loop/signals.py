@@ -1,0 +1,48 @@
+"""SIGINT and SIGTERM while a run owns them."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+_log = logging.getLogger("horus.scheduler")
+_OWNED = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextlib.contextmanager
+def stop_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
+    """Turn the first SIGINT or SIGTERM into `stop(reason)`, and let a second one force exit.
+
+    The previous handlers come back afterwards. Only the main thread can own
+    signals; in another one nothing is changed.
+
+    Python-level handlers, not `loop.add_signal_handler`: they also run while a
+    node's Python code blocks the loop, and they can be put back as they were
+    (`remove_signal_handler` installs the default instead).
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    received: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if received:
+            _log.critical("%s again: exiting at once", signal.Signals(number).name)
+            logging.shutdown()
+            os._exit(128 + number)
+        received.append(number)
+        stop(f"received {signal.Signals(number).name}")
+
+    previous = {number: signal.signal(number, handle) for number in _OWNED}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            # None: installed from C, out of Python's reach to put back.
+            if handler is not None:
+                signal.signal(number, handler)

@@ -1,0 +1,238 @@
+"""Deterministic mode: every class on one thread, in virtual time, in a fixed order."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Collection, Iterable
+
+from horus import clock
+from horus.clock import SimClock, Timeline
+from horus.errors import StateError
+from horus.graph import contradictions, dataflow_order
+from horus.live import LiveNode
+from horus.loop.private_loop import VirtualLoop
+from horus.loop.releases import ReleaseQueue
+from horus.loop.stepping import Stepper
+from horus.units import to_s
+
+_log = logging.getLogger("horus.scheduler")
+
+_MAX_EVENTS_AT_ONCE = 10_000
+"""Event ticks at one instant beyond which a feedback loop is assumed."""
+
+
+class Simulation(Stepper):
+    """A discrete-event simulation of the run loop.
+
+    `advance` is its body::
+
+        while something happens before the end:
+            move the clock to the earliest release or timer
+            let async ticks go on whose sleep is over
+            for each node released at this instant, in execution order:
+                tick it; an async tick starts and goes on until it awaits
+                tick the event nodes whose messages have arrived
+        move the clock to the end
+
+    Execution order is `order`, then publishers before subscribers, then
+    insertion. A tick takes no virtual time, except what it awaits.
+
+    Thread: one at a time.
+    """
+
+    def __init__(self, timeline: Timeline, sim_clock: SimClock) -> None:
+        """Begin at the clock's instant, with no nodes."""
+        super().__init__(timeline)
+        self._clock = sim_clock
+        self._releases = ReleaseQueue()
+        self._members: dict[LiveNode, None] = {}
+        self._messaged: dict[LiveNode, None] = {}
+        self._in_flight: dict[LiveNode, asyncio.Task[None]] = {}
+        self._places: dict[LiveNode, tuple[int, int]] = {}
+        self._virtual: VirtualLoop | None = None
+
+    def make_loop(self) -> VirtualLoop:
+        """Return a loop on simulated time."""
+        self._virtual = VirtualLoop(self._clock)
+        return self._virtual
+
+    # -- membership ---------------------------------------------------------------
+
+    def start(self, lives: Iterable[LiveNode]) -> None:
+        """Initialise the nodes and begin the release grid."""
+        self.initialize(lives)
+        self.timeline.begin(self._clock.now_ns())
+        clock.set_ambient(self.timeline)
+        for live in lives:
+            self._join(live)
+        self._find_order()
+        for edge in contradictions(list(self._members)):
+            _log.info(
+                "order runs %s before %s, which publishes its topic %r: "
+                "each message arrives one cycle later",
+                edge.subscriber,
+                edge.publisher,
+                edge.topic,
+            )
+
+    def add(self, live: LiveNode) -> None:
+        """Initialise a node during the run and let it tick."""
+        self.initialize([live])
+        self._join(live)
+        self._find_order()
+
+    def remove(self, live: LiveNode) -> None:
+        """Shut a node down during the run."""
+        self._releases.remove(live)
+        self._members.pop(live, None)
+        self._messaged.pop(live, None)
+        if live.trigger is not None:
+            live.trigger.wake = None
+        task = self._in_flight.pop(live, None)
+        if task is not None:
+            task.cancel()
+        self.shut_down_one(live)
+
+    def retime(self, live: LiveNode) -> None:
+        """Move a node to the grid of its changed rate."""
+        self._releases.retime(live, self._clock.now_ns() + 1)
+
+    def shut_down(self, lives: Iterable[LiveNode]) -> None:
+        """Cancel async ticks, then call each node's `shutdown()` in reverse order."""
+        for task in self._in_flight.values():
+            task.cancel()
+        self._settle()
+        super().shut_down(lives)
+        self._releases.clear()
+        self._members.clear()
+        self._messaged.clear()
+
+    def _join(self, live: LiveNode) -> None:
+        self._members[live] = None
+        trigger = live.trigger
+        if trigger is None:
+            self._releases.add(live, live.rank, self._clock.now_ns())
+            return
+        trigger.wake = lambda: self._messaged.setdefault(live)
+        if trigger.queue:
+            self._messaged.setdefault(live)
+
+    def _find_order(self) -> None:
+        in_order_of_arrival = sorted(self._members, key=lambda live: live.sequence)
+        place = {name: index for index, name in enumerate(dataflow_order(in_order_of_arrival))}
+        self._places = {live: (place[live.name], 0) for live in self._members}
+        self._releases.rerank(self._places)
+
+    # -- time ----------------------------------------------------------------------
+
+    def advance(
+        self,
+        until_ns: int | None,
+        stopped: Callable[[], bool],
+        only: Collection[LiveNode] | None = None,
+    ) -> None:
+        """Simulate what happens before `until_ns`; None until stopped or nothing is left.
+
+        Args:
+            until_ns: The end, exclusive [ns].
+            stopped: Asked between ticks whether to end early.
+            only: The nodes that may tick; None lets all of them.
+        """
+        self._deliver(stopped, only)
+        while not stopped():
+            instant_ns = self._next_ns()
+            if instant_ns is None or (until_ns is not None and instant_ns >= until_ns):
+                break
+            self._clock.advance_to(instant_ns)
+            self._settle()
+            self._deliver(stopped, only)
+            while not stopped() and (due := self._releases.pop_due(instant_ns)) is not None:
+                live, release_ns = due
+                if only is None or live in only:
+                    self._release(live, release_ns)
+                    self._deliver(stopped, only)
+        if until_ns is not None and not stopped():
+            self._clock.advance_to(until_ns)
+
+    def cycle(self, stopped: Callable[[], bool], named: Collection[LiveNode] | None) -> None:
+        """Advance by one cycle; nodes that are named tick in it exactly once, due or not."""
+        grid = self.timeline.grid
+        now_ns = self._clock.now_ns()
+        end_ns = grid.at(grid.index_at(now_ns) + 1)
+        if named is None:
+            self.advance(end_ns, stopped)
+            return
+        for live in sorted(named, key=self._places.__getitem__):
+            if live.trigger is None:
+                self._release(live, now_ns)
+            self._deliver(stopped, named)
+        self.advance(end_ns, stopped, only=())
+
+    def _next_ns(self) -> int | None:
+        timer_ns = self._virtual.next_timer_ns if self._virtual is not None else None
+        return min((t for t in (self._releases.next_ns, timer_ns) if t is not None), default=None)
+
+    # -- ticks ----------------------------------------------------------------------
+
+    def _release(self, live: LiveNode, release_ns: int) -> None:
+        if not live.node.is_async:
+            self._plain[live](release_ns)
+            return
+        if live in self._in_flight:
+            live.counters.skipped += 1
+            return
+        task = self._in_flight[live] = self.step_loop.loop.create_task(
+            self._async[live](release_ns),
+            name=f"horus:{live.name}",
+            context=live.context,
+        )
+        task.add_done_callback(lambda _: self._in_flight.pop(live, None))
+        self._settle()
+
+    def _settle(self) -> None:
+        if self._virtual is not None:
+            self._virtual.settle()
+
+    def _deliver(self, stopped: Callable[[], bool], only: Collection[LiveNode] | None) -> None:
+        """Tick event nodes, one per message, until no message waits."""
+        if not self._messaged:
+            return
+        for _ in range(_MAX_EVENTS_AT_ONCE):
+            ready = [
+                live
+                for live in self._messaged
+                if (only is None or live in only) and live not in self._in_flight
+            ]
+            if not ready or stopped():
+                return
+            self._tick_event(min(ready, key=self._places.__getitem__))
+        raise StateError(
+            f"event nodes have ticked {_MAX_EVENTS_AT_ONCE} times at t={self._clock.now_ns()} ns "
+            "without coming to rest: their topics form a feedback loop"
+        )
+
+    def _tick_event(self, live: LiveNode) -> None:
+        trigger = live.trigger
+        assert trigger is not None
+        if not trigger.queue or live.retired:
+            self._messaged.pop(live, None)
+            return
+        delay_ns = live.resume_after_ns()
+        if delay_ns:
+            # Restarting: the messages wait for the end of the back-off.
+            self._messaged.pop(live, None)
+            self.step_loop.loop.call_later(to_s(delay_ns), self._messaged.setdefault, live)
+            self._settle()
+            return
+        received = trigger.received
+
+        def ticked(_: object) -> None:
+            trigger.consume_one_since(received)
+
+        self._release(live, self._clock.now_ns())
+        task = self._in_flight.get(live)
+        if task is None:
+            ticked(None)
+        else:
+            task.add_done_callback(ticked)

@@ -1,0 +1,131 @@
+"""Driving nodes from plain code on one thread: `tick_once` and deterministic mode.
+
+Both run every node, of every class, inline. `Stepper` holds what they share:
+each node's tick path, and a private event loop for the async ones.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Iterable
+
+from horus import clock
+from horus.clock import Timeline
+from horus.live import LiveNode
+from horus.loop.private_loop import StepLoop
+from horus.spec import ExecutionClass, NodeState
+from horus.tick_path import RunTick, RunTickAsync, build_async_tick, build_tick
+
+_log = logging.getLogger("horus.scheduler")
+
+
+class Stepper:
+    """Initialises, ticks and shuts down nodes on the calling thread.
+
+    Thread: one at a time.
+    """
+
+    def __init__(self, timeline: Timeline) -> None:
+        """Begin with no nodes."""
+        self.timeline = timeline
+        self._plain: dict[LiveNode, RunTick] = {}
+        self._async: dict[LiveNode, RunTickAsync] = {}
+        self._step_loop: StepLoop | None = None
+
+    @property
+    def step_loop(self) -> StepLoop:
+        """The private event loop of the async nodes, made when the first one needs it."""
+        if self._step_loop is None:
+            self._step_loop = self.make_loop()
+        return self._step_loop
+
+    def make_loop(self) -> StepLoop:
+        """Return a loop on real time."""
+        return StepLoop(asyncio.new_event_loop())
+
+    def start(self, lives: Iterable[LiveNode]) -> None:
+        """Begin with these nodes: call `init()` of each, in order."""
+        self.initialize(lives)
+
+    def add(self, live: LiveNode) -> None:
+        """Take on a node that came later."""
+        self.initialize([live])
+
+    def remove(self, live: LiveNode) -> None:
+        """Shut a node down and forget it."""
+        self.shut_down_one(live)
+
+    def retime(self, live: LiveNode) -> None:
+        """Do nothing: steps have no rates."""
+
+    def initialize(self, lives: Iterable[LiveNode]) -> None:
+        """Make each node ready to tick, calling `init()` of those that have not had it."""
+        for live in sorted(lives, key=lambda live: live.rank):
+            if live.node.is_async:
+                self._async[live] = build_async_tick(live)
+            else:
+                self._plain[live] = build_tick(live)
+            if live.state is NodeState.UNINITIALIZED:
+                self.run_phase(live, "init")
+            live.enter_service()
+
+    def run_phase(self, live: LiveNode, phase: str) -> None:
+        """Run a callback other than `tick`."""
+        if live.node.is_async:
+            self.step_loop.run(live.run_phase_async(phase), live.context)
+        else:
+            live.run_phase(phase)
+
+    def tick(self, live: LiveNode, release_ns: int) -> None:
+        """Run a tick to its end."""
+        if live.node.is_async:
+            self.step_loop.run(self._async[live](release_ns), live.context)
+        else:
+            self._plain[live](release_ns)
+
+    def step(self, lives: Iterable[LiveNode]) -> None:
+        """Tick the given nodes once, in order, without rate control.
+
+        An event node ticks once per message that waits when its turn comes.
+        """
+        timeline = self.timeline
+        timeline.begin(timeline.now_ns())
+        clock.set_ambient(timeline)
+        for live in sorted(lives, key=lambda live: live.rank):
+            if live.spec.execution_class is ExecutionClass.EVENT:
+                self._tick_per_message(live)
+            else:
+                self.tick(live, timeline.now_ns())
+        timeline.pause()
+
+    def shut_down(self, lives: Iterable[LiveNode]) -> None:
+        """Call `shutdown()` of each initialised node, in reverse order."""
+        for live in sorted(lives, key=lambda live: live.rank, reverse=True):
+            self.shut_down_one(live)
+
+    def shut_down_one(self, live: LiveNode) -> None:
+        """Call `shutdown()` of a node, if it is initialised."""
+        live.leave_service()
+        if live.initialized:
+            live.state = NodeState.STOPPING
+            self.run_phase(live, "shutdown")
+            live.stopped()
+        self._plain.pop(live, None)
+        self._async.pop(live, None)
+
+    def close(self) -> None:
+        """Give the private loop back."""
+        if self._step_loop is not None:
+            self._step_loop.close()
+            self._step_loop = None
+
+    def _tick_per_message(self, live: LiveNode) -> None:
+        trigger = live.trigger
+        assert trigger is not None
+        for _ in range(len(trigger.queue)):
+            received = trigger.received
+            self.tick(live, self.timeline.now_ns())
+            trigger.consume_one_since(received)
+            if not trigger.queue:
+                return

@@ -1,0 +1,81 @@
+"""Supervision: a thread with an event loop of its own, which no node can block."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+import threading
+import traceback
+from collections.abc import Coroutine
+from typing import Any
+
+_log = logging.getLogger("horus.supervisor")
+
+
+class Supervisor:
+    """Runs supervision tasks beside the run loop.
+
+    User code can block the main loop, an application's loop or an Rt thread;
+    what must happen anyway is a task here.
+
+    Thread: any for `spawn`; `start` and `close` belong to the run loop.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Prepare the thread of the scheduler called `name`."""
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(
+            target=self._serve, name=f"horus-supervisor:{name}", daemon=True
+        )
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def spawn(self, task: Coroutine[Any, Any, None]) -> None:
+        """Run a supervision task."""
+        asyncio.run_coroutine_threadsafe(task, self._loop)
+
+    def close(self) -> None:
+        """Cancel what runs and end the thread."""
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+
+    def _serve(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_forever()
+        finally:
+            pending = asyncio.all_tasks(self._loop)
+            for task in pending:
+                task.cancel()
+            if pending:
+                self._loop.run_until_complete(asyncio.gather(*pending, return_exceptions=True))
+            self._loop.close()
+
+
+async def report_blocked_loop(
+    loop_thread_id: int, reacted: threading.Event, patience_s: float
+) -> None:
+    """Say where the event loop is stuck when it does not react to a stop.
+
+    Args:
+        loop_thread_id: The thread that was asked to stop.
+        reacted: Set by the loop when it begins to stop.
+        patience_s: How long to wait before each message [s].
+    """
+    while not reacted.is_set():
+        await asyncio.sleep(patience_s)
+        if not reacted.is_set():
+            _log.error(
+                "the event loop has not reacted to a stop for %g s; it is blocked in:\n%s",
+                patience_s,
+                stack_of(loop_thread_id),
+            )
+
+
+def stack_of(thread_id: int) -> str:
+    """Return the current Python stack of a thread, innermost call last."""
+    frame = sys._current_frames().get(thread_id)
+    return "  (no such thread)" if frame is None else "".join(traceback.format_stack(frame))

@@ -1,0 +1,216 @@
+"""The tick path: what happens around every call of a node's `tick`, in every class.
+
+`build_tick` makes one bound callable per node, `build_async_tick` its awaitable
+twin. Both do, in this order:
+
+1. admit: a node that is restarting, skipping or leaving does not tick;
+2. enter the tick context, so that `horus.now()` and `horus.dt()` answer;
+3. call the user's function, holding on to whatever it raises;
+4. count: ticks, execution time, start latency;
+5. decide (`escalation.decide`, pure) and act, if anything is out of order.
+
+No lock is taken and nothing is logged unless something is wrong.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import threading
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from horus.errors import NodeError
+from horus.escalation import Action, Outcome, decide
+from horus.live import Admission, LiveNode
+
+RunTick = Callable[[int], None]
+RunTickAsync = Callable[[int], Coroutine[Any, Any, None]]
+
+
+def build_tick(live: LiveNode) -> RunTick:
+    """Return `run_tick(release_ns)` for a plain function. It raises KeyboardInterrupt at most."""
+    callback = live.callbacks["tick"]
+    assert callback is not None
+    run_in_context = live.context.run
+    now_ns = live.timeline.now_ns
+    context = live.tick_context
+    finish = _build_finish(live)
+
+    def run_tick(release_ns: int) -> None:
+        if live.gated and not _admitted(live):
+            return
+        context.release_ns = release_ns
+        context.previous_ns = context.start_ns
+        context.start_ns = start_ns = now_ns()
+        context.ticking = True
+        live.running_since_ns = start_ns
+        error: BaseException | None = None
+        try:
+            result = run_in_context(callback)
+            if result is not None and inspect.iscoroutine(result):
+                result.close()
+                error = _not_declared_async()
+        except BaseException as exc:
+            if _is_interrupt(exc):
+                live.control.request_stop("KeyboardInterrupt")
+                raise
+            error = exc
+        finish(release_ns, start_ns, error)
+        # The exception's traceback refers to this frame: let go of it, or each
+        # failed tick leaves a cycle to the garbage collector.
+        error = None
+
+    return run_tick
+
+
+def build_async_tick(live: LiveNode) -> RunTickAsync:
+    """Return `await run_tick(release_ns)` for a coroutine function.
+
+    The caller runs it in a task of the node's context. Cancelling that task
+    ends the tick without counting it as failed.
+    """
+    callback = live.callbacks["tick"]
+    assert callback is not None
+    now_ns = live.timeline.now_ns
+    context = live.tick_context
+    finish = _build_finish(live)
+
+    async def run_tick(release_ns: int) -> None:
+        if live.gated and not await _admitted_async(live):
+            return
+        context.release_ns = release_ns
+        context.previous_ns = context.start_ns
+        context.start_ns = start_ns = now_ns()
+        context.ticking = True
+        live.running_since_ns = start_ns
+        error: BaseException | None = None
+        try:
+            await callback()
+        except asyncio.CancelledError as exc:
+            if _being_cancelled():
+                context.ticking = False
+                live.running_since_ns = 0
+                raise
+            error = exc
+        except BaseException as exc:
+            error = exc
+        finish(release_ns, start_ns, error)
+        # The exception's traceback refers to this frame: let go of it, or each
+        # failed tick leaves a cycle to the garbage collector.
+        error = None
+
+    return run_tick
+
+
+def _build_finish(live: LiveNode) -> Callable[[int, int, BaseException | None], None]:
+    now_ns = live.timeline.now_ns
+    context = live.tick_context
+    counters = live.counters
+    add_execution = counters.execution.add
+    add_latency = counters.start_latency.add
+
+    def finish(release_ns: int, start_ns: int, error: BaseException | None) -> None:
+        finish_ns = now_ns()
+        live.running_since_ns = 0
+        context.ticking = False
+        context.ticks += 1
+        execution_ns = finish_ns - start_ns
+        counters.ticks += 1
+        if counters.first_release_ns is None:
+            counters.first_release_ns = release_ns
+        counters.last_release_ns = release_ns
+        add_execution(execution_ns)
+        add_latency(start_ns - release_ns)
+        over_budget_ns = execution_ns - live.budget_ns
+        past_deadline_ns = finish_ns - release_ns - live.deadline_ns
+        if over_budget_ns > 0 or past_deadline_ns > 0 or error is not None or live.in_episode:
+            _settle(live, over_budget_ns, past_deadline_ns, error)
+
+    return finish
+
+
+def _settle(
+    live: LiveNode, over_budget_ns: int, past_deadline_ns: int, error: BaseException | None
+) -> None:
+    """Count what went wrong, decide what follows and do it."""
+    counters = live.counters
+    outcome = Outcome(max(0, over_budget_ns), max(0, past_deadline_ns), error is not None)
+    action = decide(
+        outcome,
+        on_miss=live.spec.on_miss,
+        failure_policy=live.spec.failure_policy,
+        in_episode=live.in_episode,
+    )
+    live.in_episode = outcome.missed
+    if error is not None:
+        live.tick_failed(error)
+    if outcome.over_budget_ns:
+        counters.budget_overruns += 1
+    if outcome.past_deadline_ns:
+        counters.deadline_misses += 1
+        live.control.count_miss()
+    _act(live, outcome, action, error)
+
+
+def _act(live: LiveNode, outcome: Outcome, action: Action, error: BaseException | None) -> None:
+    if action.warn:
+        text = live.limit_exceeded(outcome.over_budget_ns, outcome.past_deadline_ns)
+        if action.stop:
+            live.control.request_stop(f"node {live.name!r} {text}")
+    if action.enter_safe_state:
+        live.enter_safe_state()
+    if action.skip_next:
+        live.skip_next = live.gated = True
+    if action.fatal and error is not None:
+        live.control.fail(_as_node_error(live, error))
+    if action.restart:
+        live.plan_restart()
+
+
+def _as_node_error(live: LiveNode, error: BaseException) -> NodeError:
+    failure = NodeError(live.name, "tick", error)
+    failure.__cause__ = error
+    return failure
+
+
+def _admitted(live: LiveNode) -> bool:
+    admission = live.admit()
+    if admission is Admission.RESTART:
+        live.restarted(live.run_phase("init"))
+        admission = live.admit()
+    return _counted(live, admission)
+
+
+async def _admitted_async(live: LiveNode) -> bool:
+    admission = live.admit()
+    if admission is Admission.RESTART:
+        live.restarted(await live.run_phase_async("init"))
+        admission = live.admit()
+    return _counted(live, admission)
+
+
+def _counted(live: LiveNode, admission: Admission) -> bool:
+    if admission is Admission.TICK:
+        return True
+    live.counters.skipped += 1
+    return False
+
+
+def _not_declared_async() -> TypeError:
+    return TypeError(
+        "tick() returned a coroutine that nobody would await; declare it with `async def`, "
+        "or pass the coroutine function itself instead of a function that calls it"
+    )
+
+
+def _is_interrupt(exc: BaseException) -> bool:
+    """Return whether this is the user's Ctrl+C, which goes to the main thread only."""
+    return isinstance(exc, KeyboardInterrupt) and (
+        threading.current_thread() is threading.main_thread()
+    )
+
+
+def _being_cancelled() -> bool:
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
