@@ -16,6 +16,7 @@ from collections.abc import Callable
 from contextvars import ContextVar
 from typing import Protocol
 
+from horus.stats import NodeCounters
 from horus.timing import ReleaseGrid
 from horus.units import NS_PER_S, to_s
 
@@ -109,13 +110,27 @@ class Timeline:
         if self._paused_at is None:
             self._paused_at = self.current_cycle() + 1
 
+    def begin_step(self) -> int:
+        """Begin a single cycle outside of any grid; return the instant [ns]."""
+        now_ns = self.now_ns()
+        if self.started_ns is None:
+            self.started_ns = now_ns
+        return now_ns
+
+    def end_step(self) -> None:
+        """Count the cycle that `begin_step` began."""
+        if self._paused_at is not None:
+            self._paused_at += 1
+
     def cycle_at(self, instant_ns: int) -> int:
         """Return the number of the cycle that `instant_ns` falls in."""
+        if self._paused_at is not None:
+            return self._paused_at
         return self._first_cycle + max(0, self.grid.index_at(instant_ns))
 
     def current_cycle(self) -> int:
         """Return the number of the cycle now, or of the next one when nothing runs."""
-        return self.cycle_at(self.now_ns()) if self._paused_at is None else self._paused_at
+        return self.cycle_at(self.now_ns())
 
     def wall_s(self) -> float:
         """Return wall time [s]: fixed at construction plus monotonic progress."""
@@ -138,6 +153,7 @@ class TickContext:
 
     __slots__ = (
         "budget_ns",
+        "counters",
         "fixed_dt_s",
         "node",
         "nominal_dt_s",
@@ -146,13 +162,13 @@ class TickContext:
         "release_ns",
         "start_ns",
         "ticking",
-        "ticks",
         "timeline",
     )
 
-    def __init__(self, node: str, timeline: Timeline) -> None:
+    def __init__(self, node: str, timeline: Timeline, counters: NodeCounters) -> None:
         """Describe a node that has not ticked yet."""
         self.node = node
+        self.counters = counters
         self.timeline = timeline
         self.nominal_dt_s = 0.0
         self.fixed_dt_s: float | None = None
@@ -161,7 +177,6 @@ class TickContext:
         self.release_ns = 0
         self.start_ns = NEVER
         self.ticking = False
-        self.ticks = 0
         self.random: tuple[int, random.Random] | None = None
 
     def dt_s(self) -> float:
@@ -174,8 +189,8 @@ class TickContext:
 
     def cycle(self) -> int:
         """Return the scheduler's cycle number of this tick."""
-        timeline = self.timeline
-        return timeline.cycle_at(self.release_ns) if self.ticking else timeline.current_cycle()
+        instant_ns = self.release_ns if self.ticking else self.timeline.now_ns()
+        return self.timeline.cycle_at(instant_ns)
 
     def budget_left_s(self) -> float:
         """Return what is left of the budget [s], down to 0; inf without one."""
@@ -188,10 +203,11 @@ class TickContext:
         seed = self.timeline.seed
         if seed is None:
             return _system_random.random()
-        if self.random is None or self.random[0] != self.ticks:
+        tick = self.counters.ticks
+        if self.random is None or self.random[0] != tick:
             # Seeded per tick, not per run: a node that draws once more in one
             # tick does not shift the numbers of every later tick.
-            self.random = (self.ticks, random.Random(f"{seed}/{self.node}/{self.ticks}"))
+            self.random = (tick, random.Random(f"{seed}/{self.node}/{tick}"))
         return self.random[1].random()
 
 
@@ -204,7 +220,8 @@ _ambient: weakref.ref[Timeline] | None = None
 def set_ambient(timeline: Timeline) -> None:
     """Let the clock functions answer for `timeline` when called outside callbacks."""
     global _ambient
-    _ambient = weakref.ref(timeline)
+    if _outside() is not timeline:
+        _ambient = weakref.ref(timeline)
 
 
 def clear_ambient(timeline: Timeline) -> None:

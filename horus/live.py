@@ -71,7 +71,7 @@ class LiveNode:
         self.trigger: Subscription | None = None
         self.publishes = frozenset(pub.topic for pub in node.pubs)
         self.subscribes = frozenset(sub.topic for sub in node.subs)
-        self.tick_context = TickContext(node.name, timeline)
+        self.tick_context = TickContext(node.name, timeline, self.counters)
         self.context = contextvars.copy_context()
         self.context.run(clock.current.set, self.tick_context)
         self.gated = False
@@ -80,8 +80,6 @@ class LiveNode:
         """Whether the node is leaving: it never ticks again."""
         self.skip_next = False
         self.in_episode = False
-        self.running_since_ns = 0
-        """Start of the tick in progress [ns]; 0 between ticks."""
         self.callbacks = {
             phase: node.callback(phase) for phase in ("init", "tick", "shutdown", "safe_state")
         }
@@ -108,6 +106,11 @@ class LiveNode:
     def rank(self) -> tuple[int, int]:
         """The place in execution order: (order, insertion)."""
         return (self.spec.order, self.sequence)
+
+    @property
+    def ticking(self) -> bool:
+        """Whether a tick is in progress."""
+        return self.tick_context.ticking
 
     @property
     def initialized(self) -> bool:
@@ -152,12 +155,16 @@ class LiveNode:
 
     async def run_phase_async(self, phase: str) -> bool:
         """Run a callback of either kind; return whether it succeeded."""
-        error = None
+        error: BaseException | None = None
         try:
             result = self.call(phase)
             if inspect.isawaitable(result):
                 await result
-        except Exception as exc:
+        except asyncio.CancelledError as exc:
+            if being_cancelled():
+                raise
+            error = exc
+        except (Exception, SystemExit) as exc:
             error = exc
         return self._phase_ended(phase, error)
 
@@ -176,7 +183,7 @@ class LiveNode:
         result = None
         try:
             result = self.call("safe_state")
-        except Exception as exc:
+        except (Exception, SystemExit) as exc:
             self.phase_failed("safe_state", exc)
         if inspect.iscoroutine(result):
             # Only async nodes have an async hook, and their ticks run on a loop.
@@ -187,7 +194,7 @@ class LiveNode:
     async def _await_safe_state(self, hook: Awaitable[Any]) -> None:
         try:
             await hook
-        except Exception as exc:
+        except (Exception, SystemExit) as exc:
             self.phase_failed("safe_state", exc)
 
     def phase_failed(self, phase: str, exc: BaseException) -> None:
@@ -202,7 +209,7 @@ class LiveNode:
             return
         try:
             self.node.on_error(self.node, exc)
-        except Exception as second:
+        except (Exception, SystemExit) as second:
             self.emit(logging.ERROR, f"on_error() raised {type(second).__name__}: {second}", second)
 
     def emit(self, level: int, message: str, exc: BaseException | None = None) -> None:
@@ -322,26 +329,32 @@ class LiveNode:
 
     def timing(self, now_ns: int) -> NodeTiming:
         """Return the node's row of the timing report; `now_ns` is 0 when nothing runs."""
-        counters = self.counters
-        execution, latency = counters.execution, counters.start_latency
+        counters, times = self.counters, self.counters.times
         event = self.spec.execution_class is ExecutionClass.EVENT
+        ticks = max(1, counters.ticks)
         return NodeTiming(
             name=self.name,
             execution_class=self.spec.execution_class.value,
             rate_hz=None if event else self.spec.rate_hz,
             achieved_hz=counters.achieved_hz(0 if event else self.period_ns, now_ns),
             ticks=counters.ticks,
-            execution_avg_s=execution.mean_s(),
-            execution_p99_s=execution.quantile_s(0.99),
-            execution_max_s=to_s(execution.max_ns),
-            start_latency_avg_s=latency.mean_s(),
-            start_latency_p99_s=latency.quantile_s(0.99),
-            start_latency_max_s=to_s(latency.max_ns),
+            execution_avg_s=to_s(times.execution_total_ns) / ticks,
+            execution_p99_s=times.execution_quantile_s(0.99),
+            execution_max_s=to_s(times.execution_max_ns),
+            start_latency_avg_s=to_s(times.latency_total_ns) / ticks,
+            start_latency_p99_s=times.latency_quantile_s(0.99),
+            start_latency_max_s=to_s(times.latency_max_ns),
             budget_overruns=counters.budget_overruns,
             deadline_misses=counters.deadline_misses,
             skipped=counters.skipped,
             errors=counters.errors,
         )
+
+
+def being_cancelled() -> bool:
+    """Return whether the current task was asked to end, as opposed to code that raises at will."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
 
 
 class _Limiter:

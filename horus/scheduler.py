@@ -37,14 +37,16 @@ from horus.node import Node
 from horus.spec import (
     DEFAULT_CAPACITY,
     ExecutionClass,
+    NodeSpec,
     SchedulerSpec,
     check_duration,
     make_scheduler_spec,
+    optional_duration,
 )
 from horus.stats import TimingReport
 from horus.stream import MessageStream
 from horus.topics import Bus, Publisher
-from horus.units import NS_PER_US, to_s
+from horus.units import to_s
 
 _APPLICATION = "application"
 
@@ -161,6 +163,7 @@ class Scheduler:
             live.trigger = node.connect(self._bus)
             self._added += 1
             self._lives[node.name] = live
+        _warn_of_unavailable_in(node.spec)
         if self._runtime is not None:
             self._runtime.add(live)
         elif self._stepper is not None:
@@ -178,7 +181,7 @@ class Scheduler:
             ShutdownTimeout: The node's tick or `shutdown()` did not end in time.
         """
         with self._lock:
-            live = self._lives.pop(name, None)
+            live = self._lives.pop(_node_name(name), None)
         if live is None:
             return False
         if self._runtime is not None:
@@ -219,9 +222,7 @@ class Scheduler:
             ConfigError: The budget is refused.
         """
         live = self._live(name)
-        budget_ns = check_duration("budget_us", budget_us)
-        assert budget_ns is not None
-        live.apply(live.spec.with_budget_ns(max(1, round(budget_us * NS_PER_US))))
+        live.apply(live.spec.with_budget_ns(check_duration("budget_us", budget_us, "microseconds")))
 
     def add_critical_node(self, name: str, timeout_ms: float) -> None:
         """Mark a node as safety-critical, with a watchdog timeout of its own [ms].
@@ -231,7 +232,7 @@ class Scheduler:
             ConfigError: The timeout is refused.
         """
         self._live(name)
-        check_duration("timeout_ms", timeout_ms)
+        check_duration("timeout_ms", timeout_ms, "milliseconds")
         _warn_unavailable(f"add_critical_node({name!r})", "no watchdog supervises the node")
 
     # -- running -------------------------------------------------------------------
@@ -249,9 +250,9 @@ class Scheduler:
 
         Thread: any; nodes of the event loop's classes run on the calling one.
         """
-        duration_ns = check_duration("duration", duration)
+        duration_ns = optional_duration("duration", duration)
         _refuse_in_event_loop("run", "await sched.arun()")
-        with self._in_charge(show_logs=True), stop_on_signals(self._control.request_stop):
+        with self._running(show_logs=True), stop_on_signals(self._control.request_stop):
             if self._spec.deterministic:
                 self._simulate(duration_ns, shut_down_after=True)
             else:
@@ -272,14 +273,14 @@ class Scheduler:
 
         Thread: that of the running event loop.
         """
-        duration_ns = check_duration("duration", duration)
+        duration_ns = optional_duration("duration", duration)
         try:
             asyncio.get_running_loop()
         except RuntimeError:
             raise StateError(
                 "arun() needs a running asyncio or uvloop event loop; trio's will not do"
             ) from None
-        with self._in_charge(show_logs=False):
+        with self._running(show_logs=False):
             if self._spec.deterministic:
                 await self._simulate_beside_loop(duration_ns)
             else:
@@ -318,12 +319,12 @@ class Scheduler:
                 shut down.
         """
         chosen = self._chosen(names)
-        with self._in_charge(show_logs=False, keeps_session=True):
-            stepper = self._open_stepper()
-            if isinstance(stepper, Simulation):
-                stepper.cycle(self._stopping, chosen)
-            else:
-                stepper.step(self._lives.values() if chosen is None else chosen)
+        self._take_charge()
+        try:
+            stepper = self._stepper or self._open_stepper()
+            stepper.cycle(self._stopping, chosen)
+        finally:
+            self._hand_back(keeps_session=True)
         self._raise_failure()
 
     def tick_for(self, seconds: float, names: Iterable[str] | None = None) -> None:
@@ -342,7 +343,7 @@ class Scheduler:
         chosen = self._chosen(names)
         if not self._spec.deterministic:
             _refuse_in_event_loop("tick_for", "await sched.arun(duration)")
-        with self._in_charge(show_logs=False, keeps_session=True):
+        with self._running(show_logs=False, keeps_session=True):
             if self._spec.deterministic:
                 self._simulate(duration_ns, shut_down_after=False, only=chosen)
             else:
@@ -442,7 +443,7 @@ class Scheduler:
 
     def has_node(self, name: str) -> bool:
         """Return whether there is a node of that name."""
-        return name in self._lives
+        return _node_name(name) in self._lives
 
     def get_node_info(self, name: str) -> int:
         """Return a node's execution order.
@@ -536,31 +537,44 @@ class Scheduler:
     # -- internals: modes ------------------------------------------------------------
 
     @contextlib.contextmanager
-    def _in_charge(self, *, show_logs: bool, keeps_session: bool = False) -> Iterator[None]:
-        """Be the one who runs the nodes, from the state before to the state after."""
+    def _running(self, *, show_logs: bool, keeps_session: bool = False) -> Iterator[None]:
+        """Run the nodes in the block, from the state before to the state after."""
+        self._take_charge()
+        self._idle.clear()
+        self._running_thread = threading.get_ident()
+        try:
+            with logs.visible(install=show_logs, verbose=self._spec.verbose):
+                try:
+                    yield
+                finally:
+                    self._hand_back(keeps_session=keeps_session)
+        finally:
+            self._running_thread = None
+            self._idle.set()
+
+    def _take_charge(self) -> None:
+        """Become the one who runs the nodes."""
         with self._lock:
-            if self.is_running():
+            if self._status == "running":
                 raise StateError(
                     f"scheduler {self._spec.name!r} is already running; "
                     "stop it first, or use a second scheduler"
                 )
             self._status = "running"
-            self._idle.clear()
-        self._running_thread = threading.get_ident()
         self._control.begin(self._end_run)
+        if not self._session_open:
+            self._session_open = True
+            for live in self._lives.values():
+                live.renew()
+
+    def _hand_back(self, *, keeps_session: bool) -> None:
+        """Let others run the nodes again; without a session kept, they are shut down."""
         try:
-            with logs.visible(install=show_logs, verbose=self._spec.verbose):
-                self._open_session()
-                try:
-                    yield
-                finally:
-                    if not keeps_session or self._control.failure is not None:
-                        self._end_session()
+            if not keeps_session or self._control.failure is not None:
+                self._end_session()
         finally:
             self._control.end()
-            self._running_thread = None
             self._status = "idle" if self._session_open else "stopped"
-            self._idle.set()
 
     def _run_loop(
         self, duration_ns: int | None, lives: list[LiveNode], *, shut_down_after: bool
@@ -624,12 +638,6 @@ class Scheduler:
             self._stepper.close()
             self._stepper = None
 
-    def _open_session(self) -> None:
-        if not self._session_open:
-            self._session_open = True
-            for live in self._lives.values():
-                live.renew()
-
     def _end_session(self) -> None:
         """Shut down what is still initialised; the next run begins with `init()` again."""
         if not self._session_open:
@@ -675,15 +683,15 @@ class Scheduler:
 
     def _live(self, name: str) -> LiveNode:
         try:
-            return self._lives[name]
+            return self._lives[_node_name(name)]
         except KeyError:
             raise UnknownNodeError(name, self.get_node_names()) from None
 
     def _chosen(self, names: Iterable[str] | None) -> list[LiveNode] | None:
         if names is None:
             return None
-        if isinstance(names, str):
-            raise ConfigError("names", names, f"must be a list of node names, e.g. [{names!r}]")
+        if isinstance(names, str) or not isinstance(names, Iterable):
+            raise ConfigError("names", names, "must be a list of node names, e.g. ['motor']")
         return [self._live(name) for name in names]
 
     def _in_order(self) -> list[LiveNode]:
@@ -711,6 +719,12 @@ def run(*nodes: Node, duration: float | None = None, **options: Any) -> None:
         for node in nodes:
             scheduler.add(node)
         scheduler.run(duration)
+
+
+def _node_name(name: object) -> str:
+    if not isinstance(name, str):
+        raise ConfigError("name", name, "must be a node's name")
+    return name
 
 
 def _make_executors(bridge: Bridge, cycle: Cycle) -> dict[ExecutionClass, Executor]:
@@ -779,6 +793,17 @@ def _warn_of_unavailable(spec: SchedulerSpec) -> None:
     ):
         if asked:
             _warn_unavailable(argument, consequence)
+
+
+def _warn_of_unavailable_in(spec: NodeSpec) -> None:
+    where = f"of node {spec.name!r}"
+    for asked, argument, consequence in (
+        (spec.watchdog_ns, "watchdog", "a frozen tick is not detected"),
+        (spec.priority, "priority", "its thread has ordinary priority"),
+        (spec.core is not None, "core", "its thread may run on any core"),
+    ):
+        if asked:
+            _warn_unavailable(f"{argument}= {where}", consequence)
 
 
 def _warn_unavailable(argument: str, consequence: str) -> None:

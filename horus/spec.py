@@ -6,7 +6,6 @@ everything below works on the integers.
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import warnings
@@ -17,7 +16,7 @@ from typing import Any, TypeGuard, TypeVar
 
 from horus.errors import ConfigError, ConfigWarning, TopicError
 from horus.timing import period_ns
-from horus.units import NS_PER_MS, NS_PER_S, readable, to_ns
+from horus.units import NS_PER_MS, NS_PER_S, NS_PER_US, readable
 
 DEFAULT_RATE_HZ = 30.0
 DEFAULT_ORDER = 100
@@ -26,6 +25,9 @@ AUTO_BUDGET = 0.80
 AUTO_DEADLINE = 0.95
 E = TypeVar("E", bound=StrEnum)
 
+_LOWEST_RATE_HZ, _HIGHEST_RATE_HZ = 1e-6, 1e6
+_LONGEST_NS = 10**9 * NS_PER_S
+_NS_PER_UNIT = {"seconds": NS_PER_S, "milliseconds": NS_PER_MS, "microseconds": NS_PER_US}
 _SUSPICIOUS_LIMIT_NS = 60 * NS_PER_S
 _NAME = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_.\-]{0,126}[A-Za-z0-9_\-])?")
 
@@ -197,9 +199,9 @@ def make_node_spec(
         order=order,
         rate_hz=DEFAULT_RATE_HZ if rate is None else check_rate(rate),
         rate_given=rate is not None,
-        budget_ns=check_duration("budget", budget),
+        budget_ns=optional_duration("budget", budget),
         budget_given=budget is not None,
-        deadline_ns=check_duration("deadline", deadline),
+        deadline_ns=optional_duration("deadline", deadline),
         deadline_given=deadline is not None,
         on_miss=Miss.WARN if on_miss is None else _member(Miss, "on_miss", on_miss),
         failure_policy=None
@@ -214,7 +216,7 @@ def make_node_spec(
         on=None if on is None else check_topic(on),
         priority=_check_priority(priority),
         core=None if core is None else check_core("core", core),
-        watchdog_ns=check_duration("watchdog", watchdog),
+        watchdog_ns=optional_duration("watchdog", watchdog),
     )
     _warn_about_units(spec)
     return _derive_limits(spec)
@@ -317,26 +319,39 @@ def check_rate(value: object, argument: str = "rate") -> float:
     """Return a rate [Hz] as float.
 
     Raises:
-        ConfigError: Not a finite number above zero.
+        ConfigError: Not a number from 1e-6 to 1e6.
     """
-    if not _is_number(value) or not math.isfinite(value) or value <= 0:
-        raise ConfigError(argument, value, "must be a finite number of Hz above zero")
-    return float(value)
+    return _check_range(argument, value, "Hz", _LOWEST_RATE_HZ, _HIGHEST_RATE_HZ)
 
 
-def check_duration(argument: str, value: object) -> int | None:
+def check_duration(argument: str, value: object, unit: str = "seconds") -> int:
+    """Return a duration, given in `unit`, in nanoseconds [ns].
+
+    Raises:
+        ConfigError: Not a number above zero and below thirty years.
+    """
+    scale = _NS_PER_UNIT[unit]
+    least = 1 / scale
+    return round(_check_range(argument, value, unit, least, _LONGEST_NS / scale) * scale)
+
+
+def optional_duration(argument: str, value: object) -> int | None:
     """Return a duration [s] in nanoseconds [ns]; None stays None.
 
     Raises:
-        ConfigError: Not a finite number of seconds above zero.
+        ConfigError: Neither None nor a number above zero and below thirty years.
     """
-    if value is None:
-        return None
-    if not _is_number(value) or not math.isfinite(value) or value <= 0 or to_ns(value) < 1:
+    return None if value is None else check_duration(argument, value)
+
+
+def _check_range(argument: str, value: object, unit: str, least: float, most: float) -> float:
+    # NaN fails the comparison, and so does what is too large for a float.
+    if not _is_number(value) or not least <= value <= most:
+        example = f", e.g. {argument}=300 * us" if unit == "seconds" else ""
         raise ConfigError(
-            argument, value, "must be a finite number of seconds above zero, e.g. 300 * us"
+            argument, value, f"must be a number of {unit} from {least:g} to {most:g}{example}"
         )
-    return to_ns(value)
+    return float(value)
 
 
 def check_core(argument: str, value: object) -> int:
@@ -436,9 +451,8 @@ def make_scheduler_spec(
     """
     if loop not in ("uvloop", "asyncio"):
         raise ConfigError("loop", loop, "must be 'uvloop' or 'asyncio'")
-    if telemetry is not None and not isinstance(telemetry, str):
+    if telemetry is not None and (not isinstance(telemetry, str) or not telemetry):
         raise ConfigError("telemetry", telemetry, "must be an endpoint URL")
-    timeout_ns = check_duration("shutdown_timeout", shutdown_timeout)
     return SchedulerSpec(
         name="horus" if name is None else check_name("name", name),
         tick_rate_hz=check_rate(tick_rate, "tick_rate"),
@@ -454,7 +468,7 @@ def make_scheduler_spec(
         verbose=_check_flag("verbose", verbose),
         telemetry=telemetry,
         loop=loop,
-        shutdown_timeout_ns=3 * NS_PER_S if timeout_ns is None else timeout_ns,
+        shutdown_timeout_ns=check_duration("shutdown_timeout", shutdown_timeout),
         seed=_check_count("seed", seed),
     )
 

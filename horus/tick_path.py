@@ -22,7 +22,7 @@ from typing import Any
 
 from horus.errors import NodeError
 from horus.escalation import Action, Outcome, decide
-from horus.live import Admission, LiveNode
+from horus.live import Admission, LiveNode, being_cancelled
 
 RunTick = Callable[[int], None]
 RunTickAsync = Callable[[int], Coroutine[Any, Any, None]]
@@ -44,7 +44,6 @@ def build_tick(live: LiveNode) -> RunTick:
         context.previous_ns = context.start_ns
         context.start_ns = start_ns = now_ns()
         context.ticking = True
-        live.running_since_ns = start_ns
         error: BaseException | None = None
         try:
             result = run_in_context(callback)
@@ -83,14 +82,12 @@ def build_async_tick(live: LiveNode) -> RunTickAsync:
         context.previous_ns = context.start_ns
         context.start_ns = start_ns = now_ns()
         context.ticking = True
-        live.running_since_ns = start_ns
         error: BaseException | None = None
         try:
             await callback()
         except asyncio.CancelledError as exc:
-            if _being_cancelled():
+            if being_cancelled():
                 context.ticking = False
-                live.running_since_ns = 0
                 raise
             error = exc
         except BaseException as exc:
@@ -107,21 +104,17 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, BaseException | None], 
     now_ns = live.timeline.now_ns
     context = live.tick_context
     counters = live.counters
-    add_execution = counters.execution.add
-    add_latency = counters.start_latency.add
+    add_times = counters.times.add
 
     def finish(release_ns: int, start_ns: int, error: BaseException | None) -> None:
         finish_ns = now_ns()
-        live.running_since_ns = 0
         context.ticking = False
-        context.ticks += 1
         execution_ns = finish_ns - start_ns
         counters.ticks += 1
         if counters.first_release_ns is None:
             counters.first_release_ns = release_ns
         counters.last_release_ns = release_ns
-        add_execution(execution_ns)
-        add_latency(start_ns - release_ns)
+        add_times(execution_ns, start_ns - release_ns)
         over_budget_ns = execution_ns - live.budget_ns
         past_deadline_ns = finish_ns - release_ns - live.deadline_ns
         if over_budget_ns > 0 or past_deadline_ns > 0 or error is not None or live.in_episode:
@@ -209,8 +202,3 @@ def _is_interrupt(exc: BaseException) -> bool:
     return isinstance(exc, KeyboardInterrupt) and (
         threading.current_thread() is threading.main_thread()
     )
-
-
-def _being_cancelled() -> bool:
-    task = asyncio.current_task()
-    return task is not None and task.cancelling() > 0

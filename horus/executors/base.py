@@ -49,7 +49,7 @@ class LoopExecutor:
 
         if not self._bridge.on_loop_thread():
             self._bridge.post(run)
-        elif live.running_since_ns:
+        elif live.ticking:
             # The node's own tick is on the stack below us.
             self._loop.call_soon(run)
         else:

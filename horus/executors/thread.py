@@ -116,5 +116,5 @@ class ThreadExecutor(ABC, Generic[T]):
         thread = self._threads.pop(live, None)
         if thread is not None:
             thread.close()
-            if thread is not threading.current_thread() and not live.running_since_ns:
+            if thread is not threading.current_thread() and not live.ticking:
                 thread.join(_LAST_STEPS_S)

@@ -160,6 +160,9 @@ class Runtime:
 
     def _open(self, resources: contextlib.ExitStack) -> None:
         """Acquire what the run needs; the stack gives it back in reverse."""
+        # anyio loads its backend on first use, which takes tens of milliseconds:
+        # now, not after the first release.
+        anyio.current_effective_deadline()
         self._supervisor = Supervisor(self._name)
         self._supervisor.start()
         resources.callback(self._supervisor.close)

@@ -6,7 +6,6 @@ import asyncio
 import logging
 from collections.abc import Callable, Collection, Iterable
 
-from horus import clock
 from horus.clock import SimClock, Timeline
 from horus.errors import StateError
 from horus.graph import contradictions, dataflow_order
@@ -46,7 +45,6 @@ class Simulation(Stepper):
         super().__init__(timeline)
         self._clock = sim_clock
         self._releases = ReleaseQueue()
-        self._members: dict[LiveNode, None] = {}
         self._messaged: dict[LiveNode, None] = {}
         self._in_flight: dict[LiveNode, asyncio.Task[None]] = {}
         self._places: dict[LiveNode, tuple[int, int]] = {}
@@ -61,13 +59,11 @@ class Simulation(Stepper):
 
     def start(self, lives: Iterable[LiveNode]) -> None:
         """Initialise the nodes and begin the release grid."""
-        self.initialize(lives)
+        super().start(lives)
         self.timeline.begin(self._clock.now_ns())
-        clock.set_ambient(self.timeline)
-        for live in lives:
+        for live in self._in_order:
             self._join(live)
-        self._find_order()
-        for edge in contradictions(list(self._members)):
+        for edge in contradictions(self._in_order):
             _log.info(
                 "order runs %s before %s, which publishes its topic %r: "
                 "each message arrives one cycle later",
@@ -77,22 +73,21 @@ class Simulation(Stepper):
             )
 
     def add(self, live: LiveNode) -> None:
-        """Initialise a node during the run and let it tick."""
-        self.initialize([live])
-        self._join(live)
-        self._find_order()
+        """Make a node ready to tick; during the run it joins the release grid."""
+        super().add(live)
+        if self._places:
+            self._join(live)
 
     def remove(self, live: LiveNode) -> None:
         """Shut a node down during the run."""
         self._releases.remove(live)
-        self._members.pop(live, None)
         self._messaged.pop(live, None)
         if live.trigger is not None:
             live.trigger.wake = None
         task = self._in_flight.pop(live, None)
         if task is not None:
             task.cancel()
-        self.shut_down_one(live)
+        super().remove(live)
 
     def retime(self, live: LiveNode) -> None:
         """Move a node to the grid of its changed rate."""
@@ -105,23 +100,22 @@ class Simulation(Stepper):
         self._settle()
         super().shut_down(lives)
         self._releases.clear()
-        self._members.clear()
         self._messaged.clear()
 
     def _join(self, live: LiveNode) -> None:
-        self._members[live] = None
+        self._find_order()
         trigger = live.trigger
         if trigger is None:
-            self._releases.add(live, live.rank, self._clock.now_ns())
+            self._releases.add(live, self._places[live], self._clock.now_ns())
             return
         trigger.wake = lambda: self._messaged.setdefault(live)
         if trigger.queue:
             self._messaged.setdefault(live)
 
     def _find_order(self) -> None:
-        in_order_of_arrival = sorted(self._members, key=lambda live: live.sequence)
-        place = {name: index for index, name in enumerate(dataflow_order(in_order_of_arrival))}
-        self._places = {live: (place[live.name], 0) for live in self._members}
+        by_arrival = sorted(self._in_order, key=lambda live: live.sequence)
+        place = {name: index for index, name in enumerate(dataflow_order(by_arrival))}
+        self._places = {live: (place[live.name], 0) for live in by_arrival}
         self._releases.rerank(self._places)
 
     # -- time ----------------------------------------------------------------------

@@ -7,17 +7,14 @@ each node's tick path, and a private event loop for the async ones.
 from __future__ import annotations
 
 import asyncio
-import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
 
 from horus import clock
 from horus.clock import Timeline
 from horus.live import LiveNode
 from horus.loop.private_loop import StepLoop
-from horus.spec import ExecutionClass, NodeState
+from horus.spec import NodeState
 from horus.tick_path import RunTick, RunTickAsync, build_async_tick, build_tick
-
-_log = logging.getLogger("horus.scheduler")
 
 
 class Stepper:
@@ -31,6 +28,7 @@ class Stepper:
         self.timeline = timeline
         self._plain: dict[LiveNode, RunTick] = {}
         self._async: dict[LiveNode, RunTickAsync] = {}
+        self._in_order: list[LiveNode] = []
         self._step_loop: StepLoop | None = None
 
     @property
@@ -46,29 +44,30 @@ class Stepper:
 
     def start(self, lives: Iterable[LiveNode]) -> None:
         """Begin with these nodes: call `init()` of each, in order."""
-        self.initialize(lives)
+        clock.set_ambient(self.timeline)
+        for live in lives:
+            self.add(live)
 
     def add(self, live: LiveNode) -> None:
-        """Take on a node that came later."""
-        self.initialize([live])
+        """Make a node ready to tick, calling `init()` if it has not been."""
+        if live.node.is_async:
+            self._async[live] = build_async_tick(live)
+        else:
+            self._plain[live] = build_tick(live)
+        if live.state is NodeState.UNINITIALIZED:
+            self.run_phase(live, "init")
+        live.enter_service()
+        self._in_order = sorted([*self._in_order, live], key=lambda live: live.rank)
 
     def remove(self, live: LiveNode) -> None:
         """Shut a node down and forget it."""
+        self._in_order = [other for other in self._in_order if other is not live]
         self.shut_down_one(live)
+        self._plain.pop(live, None)
+        self._async.pop(live, None)
 
     def retime(self, live: LiveNode) -> None:
         """Do nothing: steps have no rates."""
-
-    def initialize(self, lives: Iterable[LiveNode]) -> None:
-        """Make each node ready to tick, calling `init()` of those that have not had it."""
-        for live in sorted(lives, key=lambda live: live.rank):
-            if live.node.is_async:
-                self._async[live] = build_async_tick(live)
-            else:
-                self._plain[live] = build_tick(live)
-            if live.state is NodeState.UNINITIALIZED:
-                self.run_phase(live, "init")
-            live.enter_service()
 
     def run_phase(self, live: LiveNode, phase: str) -> None:
         """Run a callback other than `tick`."""
@@ -84,20 +83,23 @@ class Stepper:
         else:
             self._plain[live](release_ns)
 
-    def step(self, lives: Iterable[LiveNode]) -> None:
-        """Tick the given nodes once, in order, without rate control.
+    def cycle(self, stopped: Callable[[], bool], named: Collection[LiveNode] | None) -> None:
+        """Tick the nodes once, in order, without rate control; only those named, if any are.
 
         An event node ticks once per message that waits when its turn comes.
         """
         timeline = self.timeline
-        timeline.begin(timeline.now_ns())
-        clock.set_ambient(timeline)
-        for live in sorted(lives, key=lambda live: live.rank):
-            if live.spec.execution_class is ExecutionClass.EVENT:
+        timeline.begin_step()
+        for live in self._in_order:
+            if named is not None and live not in named:
+                continue
+            if live.trigger is not None:
                 self._tick_per_message(live)
             else:
                 self.tick(live, timeline.now_ns())
-        timeline.pause()
+            if stopped():
+                break
+        timeline.end_step()
 
     def shut_down(self, lives: Iterable[LiveNode]) -> None:
         """Call `shutdown()` of each initialised node, in reverse order."""
@@ -111,8 +113,6 @@ class Stepper:
             live.state = NodeState.STOPPING
             self.run_phase(live, "shutdown")
             live.stopped()
-        self._plain.pop(live, None)
-        self._async.pop(live, None)
 
     def close(self) -> None:
         """Give the private loop back."""
