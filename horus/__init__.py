@@ -16,8 +16,9 @@ from horus.errors import (
     UnknownNodeError,
 )
 from horus.node import Node
+from horus.ports import Pub, Sub
 from horus.scheduler import Scheduler, run
-from horus.spec import ExecutionClass, FailurePolicy, Health, Miss, NodeState, Pub, Sub
+from horus.spec import ExecutionClass, FailurePolicy, Health, Miss, NodeState
 from horus.stats import NodeTiming, TimingReport
 from horus.stream import MessageStream
 from horus.units import ms, us

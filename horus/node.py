@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import functools
-import inspect
 import logging
-from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from horus import clock
+from horus.callables import Callback, is_async_callable, takes_node
 from horus.errors import ConfigError, StateError, describe
-from horus.spec import ExecutionClass, FailurePolicy, Miss, NodeSpec, Pub, Sub, make_node_spec
+from horus.ports import Ports, Pub, Sub, declared
+from horus.spec import ExecutionClass, FailurePolicy, Miss, NodeSpec, make_node_spec
 from horus.units import to_s
 
 if TYPE_CHECKING:
     from horus.topics import Bus, Publisher, Subscription
 
-Callback = Callable[..., Any]
 ErrorCallback = Callable[["Node", BaseException], None]
-Ports = str | type | Pub | Sub | Iterable[Any] | Mapping[Any, Any] | None
-P = TypeVar("P", Pub, Sub)
 
 _log = logging.getLogger("horus.node")
 _TWO_WAYS = "is given both as an argument and as a method of the class; keep one"
@@ -121,8 +119,8 @@ class Node:
             watchdog=watchdog,
         )
         self._refuse_stray_async()
-        self.pubs: tuple[Pub, ...] = _ports("pubs", pubs, Pub)
-        self.subs: tuple[Sub, ...] = _ports("subs", subs, Sub)
+        self.pubs: tuple[Pub, ...] = declared("pubs", pubs, Pub)
+        self.subs: tuple[Sub, ...] = declared("subs", subs, Sub)
         self.log = logging.getLogger(f"horus.node.{self.spec.name}")
         self.owner: object | None = None
         self.request_stop_hook: Callable[[str], None] | None = None
@@ -249,7 +247,7 @@ class Node:
             "shutdown": self._shutdown,
             "safe_state": self._safe_state,
         }[phase]
-        if function is None or not _takes_node(function):
+        if function is None or not takes_node(function):
             return function
         return functools.partial(function, self)
 
@@ -361,66 +359,3 @@ class Node:
         if self.log.isEnabledFor(level):
             extra = {"node": self.name, "cycle": context.cycle()}
             self.log.log(level, message, *args, extra=extra, stacklevel=3)
-
-
-def is_async_callable(function: Callback) -> bool:
-    """Return whether calling `function` gives an awaitable by its declaration."""
-    while isinstance(function, functools.partial):
-        function = function.func
-    return inspect.iscoroutinefunction(function) or (
-        not inspect.isroutine(function) and inspect.iscoroutinefunction(type(function).__call__)
-    )
-
-
-def _takes_node(function: Callback) -> bool:
-    """Return whether a callback asks for the node: by a positional parameter without default."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return True
-    # A default marks a value that the author bound (`lambda i=i: ...`), not a
-    # place for the node.
-    return any(
-        parameter.kind is parameter.VAR_POSITIONAL
-        or (
-            parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-            and parameter.default is parameter.empty
-        )
-        for parameter in parameters
-    )
-
-
-def _ports(argument: str, value: Ports, kind: type[P]) -> tuple[P, ...]:
-    """Normalise every way to write `pubs` and `subs`."""
-    if value is None:
-        return ()
-    if isinstance(value, str | type | Pub | Sub):
-        items: list[Any] = [value]
-    elif isinstance(value, Mapping):
-        items = [
-            item if isinstance(item, Pub | Sub) else kind(_topic_name(topic), item)
-            for topic, item in value.items()
-        ]
-    elif isinstance(value, Iterable):
-        items = list(value)
-    else:
-        raise ConfigError(argument, value, "must be a topic, a list of topics, or {topic: type}")
-    ports: dict[str, P] = {}
-    for item in items:
-        port = _port(argument, item, kind)
-        if port.topic in ports:
-            raise ConfigError(argument, value, f"names topic {port.topic!r} twice")
-        ports[port.topic] = port
-    return tuple(ports.values())
-
-
-def _port(argument: str, item: Any, kind: type[P]) -> P:
-    if isinstance(item, kind):
-        return item
-    if isinstance(item, Pub | Sub):
-        raise ConfigError(argument, item, f"takes {kind.__name__}(...) here")
-    return kind(_topic_name(item), item if isinstance(item, type) else None)
-
-
-def _topic_name(topic: Any) -> Any:
-    return topic.__name__ if isinstance(topic, type) else topic

@@ -15,8 +15,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from horus.errors import ConfigError, TopicError, describe
+from horus.ports import DEFAULT_CAPACITY
 from horus.snapshot import ATOMS, Frozen, UnsendableError, freeze
-from horus.spec import DEFAULT_CAPACITY, check_topic
+from horus.validation import check_topic
 
 _log = logging.getLogger("horus.topics")
 
