@@ -50,6 +50,8 @@ class Admission(Enum):
     SKIP = auto()
     RESTART = auto()
     """Run `init()` again first."""
+    END = auto()
+    """The node is leaving; nothing is owed."""
 
 
 class LiveNode:
@@ -253,7 +255,7 @@ class LiveNode:
     def admit(self) -> Admission:
         """Decide whether a release of a gated node may tick."""
         if self.retired:
-            return Admission.SKIP
+            return Admission.END
         if self.state is NodeState.RESTARTING:
             waited = self.timeline.now_ns() >= self._restart_at_ns
             return Admission.RESTART if waited else Admission.SKIP

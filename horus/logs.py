@@ -7,9 +7,12 @@ import logging
 import logging.handlers
 import queue
 import sys
+import threading
 from collections.abc import Iterator
 
 _root = logging.getLogger("horus")
+_unwritten: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
+_LAST_RECORD_S = 0.05
 
 
 @contextlib.contextmanager
@@ -40,11 +43,10 @@ def visible(*, install: bool, verbose: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stderr_handler() -> Iterator[None]:
-    records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
     screen = logging.StreamHandler(sys.stderr)
     screen.setFormatter(_Formatter())
-    writer = logging.handlers.QueueListener(records, screen)
-    handler = logging.handlers.QueueHandler(records)
+    writer = logging.handlers.QueueListener(_unwritten, screen)
+    handler = logging.handlers.QueueHandler(_unwritten)
     _root.addHandler(handler)
     writer.start()
     try:
@@ -52,6 +54,18 @@ def _stderr_handler() -> Iterator[None]:
     finally:
         _root.removeHandler(handler)
         writer.stop()
+
+
+def flush(timeout_s: float = 0.5) -> None:
+    """Wait until what was logged is written, at most `timeout_s` [s]."""
+    pause = threading.Event()
+    for _ in range(int(timeout_s / _LAST_RECORD_S)):
+        # An empty queue is not enough: its last record is still on its way.
+        drained = _unwritten.empty()
+        pause.wait(_LAST_RECORD_S)
+        if drained:
+            break
+    logging.shutdown()
 
 
 class _Formatter(logging.Formatter):

@@ -212,8 +212,9 @@ class Session:
                     f"scheduler {self._spec.name!r} is already running; "
                     "stop it first, or use a second scheduler"
                 )
+            # Before the status tells anybody: a stop that comes now must count.
+            self.control.begin(self._end_run)
             self.status = "running"
-        self.control.begin(self._end_run)
         if not self._open:
             self._open = True
             for live in self.registry.in_order:

@@ -19,6 +19,7 @@ import decimal
 import enum
 import fractions
 import functools
+import operator
 import pathlib
 import re
 import sys
@@ -153,6 +154,8 @@ def _freeze_tuple(value: tuple[Any, ...]) -> Frozen:
     if _all_atoms(map(type, value)):
         return value, None
     payload, thaws = _freeze_sequence(value)
+    if all(map(operator.is_, payload, value)):
+        return value, None
     build = _tuple_builder(type(value))
     return build(payload), functools.partial(_thaw_tuple, build, thaws) if thaws else None
 

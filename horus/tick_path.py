@@ -184,10 +184,9 @@ async def _admitted_async(live: LiveNode) -> bool:
 
 
 def _counted(live: LiveNode, admission: Admission) -> bool:
-    if admission is Admission.TICK:
-        return True
-    live.counters.skipped += 1
-    return False
+    if admission is Admission.SKIP:
+        live.counters.skipped += 1
+    return admission is Admission.TICK
 
 
 def _not_declared_async() -> TypeError:

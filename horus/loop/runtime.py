@@ -86,6 +86,10 @@ class Runtime:
         if self._stop_requested.is_set():
             return
         self._stop_requested.set()
+        for live in tuple(self._homes):
+            # At once, not when the loop gets to it: a tick that asks for a stop is
+            # the last of its node.
+            live.leave_service()
         if self._bridge is not None:
             self._bridge.post(self._stop_event.set)
             self._supervisor.spawn(
@@ -197,9 +201,12 @@ class Runtime:
         """Start the release grid, and with it the ticks."""
         self._timeline.begin(self._timeline.now_ns() + _HEAD_START_NS)
         clock.set_ambient(self._timeline)
-        for live, home in self._homes.items():
-            if live.initialized:
-                home.engage(live)
+        for live in self._homes:
+            self._engage_one(live)
+
+    def _engage_one(self, live: LiveNode) -> None:
+        if live.initialized and not self._stop_requested.is_set():
+            self._homes[live].engage(live)
 
     async def _until_stopped(self, duration_s: float | None) -> None:
         if duration_s is None:
@@ -213,8 +220,7 @@ class Runtime:
         if self._stopping.is_set():
             return
         await self._adopt(live)
-        if live.initialized and not self._stopping.is_set():
-            self._homes[live].engage(live)
+        self._engage_one(live)
 
     async def _finish(self, shut_down_after: bool) -> None:
         if shut_down_after:

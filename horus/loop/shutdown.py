@@ -78,9 +78,17 @@ async def _wait_for_shutdown(live: LiveNode, shutdown: Future[bool], timeout_s: 
 
 def _stand_in(live: LiveNode) -> Future[bool]:
     future: Future[bool] = Future()
+    # A copy: the stuck tick still holds the node's own context.
+    context = live.context.copy()
+    if live.node.is_async:
+        task = asyncio.get_running_loop().create_task(
+            live.run_phase_async("shutdown"), name=f"horus-shutdown:{live.name}", context=context
+        )
+        task.add_done_callback(lambda done: future.set_result(not done.cancelled()))
+        return future
 
     def run() -> None:
-        future.set_result(live.run_phase("shutdown"))
+        future.set_result(context.run(live.run_phase, "shutdown"))
 
     threading.Thread(target=run, name=f"horus-shutdown:{live.name}", daemon=True).start()
     return future

@@ -10,6 +10,8 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+from horus import logs
+
 _log = logging.getLogger("horus.scheduler")
 _OWNED = (signal.SIGINT, signal.SIGTERM)
 
@@ -33,7 +35,7 @@ def stop_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
     def handle(number: int, frame: FrameType | None) -> None:
         if received:
             _log.critical("%s again: exiting at once", signal.Signals(number).name)
-            logging.shutdown()
+            logs.flush()
             os._exit(128 + number)
         received.append(number)
         stop(f"received {signal.Signals(number).name}")

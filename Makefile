@@ -1,0 +1,50 @@
+# Two commands on a fresh machine with python3 (>= 3.11, venv), make and a C compiler:
+#   make demo    the warehouse AGV, in real time
+#   make test    linter, types, tests, documentation
+
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check -q
+
+.PHONY: demo demo-short test lint types pytest soak docs bench clean
+
+demo: .venv/examples
+	$(BIN)/python examples/warehouse_agv.py
+
+demo-short: .venv/examples
+	$(BIN)/python examples/warehouse_agv.py --deterministic
+
+test: lint types pytest
+
+lint: .venv/dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: .venv/dev
+	$(BIN)/mypy
+
+pytest: .venv/dev
+	$(BIN)/python -m pytest
+
+soak: .venv/dev
+	$(BIN)/python -m pytest -m soak
+
+docs: .venv/dev
+	$(BIN)/mkdocs build --strict
+
+bench: .venv/dev
+	$(BIN)/python -m benchmarks micro --peers
+
+clean:
+	rm -rf .venv .bench site .mypy_cache .pytest_cache .ruff_cache .hypothesis
+
+.venv/examples: .venv/bin/python pyproject.toml
+	$(PIP) install -e '.[examples]'
+	@touch $@
+
+.venv/dev: .venv/bin/python pyproject.toml
+	$(PIP) install -e '.[dev]'
+	@touch $@ .venv/examples
+
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
