@@ -47,33 +47,45 @@ MEASURES = (
         title="topic round trip, float",
         unit="µs",
         workload="topics",
-        statistic=median_of("float_round_trip_us"),
+        statistic=median_of("float_us"),
     ),
     Measure(
         title="topic round trip, 3-float dict",
         unit="µs",
         workload="topics",
-        statistic=median_of("dict3_round_trip_us"),
+        statistic=median_of("dict3_us"),
         target=Target(bound=2.2),
     ),
     Measure(
         title="topic round trip, 3-float dict to 5 subscribers",
         unit="µs",
         workload="topics",
-        statistic=median_of("dict3_to5_round_trip_us"),
+        statistic=median_of("dict3_to5_us"),
     ),
     Measure(
         title="topic round trip, 360-float scan",
         unit="µs",
         workload="topics",
-        statistic=median_of("scan360_round_trip_us"),
+        statistic=median_of("scan360_us"),
         target=Target(bound=12.0),
     ),
     Measure(
         title="topic round trip, 1 kB string",
         unit="µs",
         workload="topics",
-        statistic=median_of("str1k_round_trip_us"),
+        statistic=median_of("str1k_us"),
+    ),
+    *(
+        Measure(
+            title=f"{title}, 100 sent before they are received",
+            unit="µs",
+            workload="topics",
+            statistic=median_of(series),
+        )
+        for title, series in (
+            ("3-float dict", "dict3_burst_us"),
+            ("360-float scan", "scan360_burst_us"),
+        )
     ),
     *(
         Measure(
@@ -173,6 +185,13 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--rounds", type=_at_least_one, metavar="N", help="default 5; 1 with --quick"
     )
+    parser.add_argument(
+        "--calm",
+        type=float,
+        default=100.0,
+        metavar="PERCENT",
+        help="repeat runs during which other processes used more than this of all CPUs",
+    )
     parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
     parser.add_argument(
         "--only",
@@ -252,6 +271,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         options.only,
         rounds=options.rounds,
         quick=options.quick,
+        max_other_load_percent=options.calm,
         progress=lambda line: print(line, file=sys.stderr, flush=True),
     )
     labels = [contender.label for contender in contenders]

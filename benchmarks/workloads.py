@@ -51,7 +51,7 @@ class Size:
 
 
 FULL = Size(
-    topic_ticks=40,
+    topic_ticks=25,
     tick_once_calls=300,
     event_s=5.0,
     cpu_warmup_s=2.0,
@@ -71,8 +71,8 @@ QUICK = Size(
 
 TOPIC_BATCH = 100
 """Messages per tick of the topic workload: enough to hide the clock reads, well below capacity."""
-TOPIC_GAP_S = 0.025
-TOPIC_RATE_HZ = 50.0
+TOPIC_GAP_S = 0.045
+TOPIC_RATE_HZ = 25.0
 TICK_ONCE_GAP_S = 0.0015
 TICK_ONCE_RATE_HZ = 1000.0
 EVENT_RATE_HZ = 200.0
@@ -92,85 +92,92 @@ def spin_for(seconds: float) -> None:
         pass
 
 
-def topic_round_trip(horus: Any, size: Size, message: object, subscribers: int) -> Series:
-    """Send and receive batches inside ticks and time both sides there.
+def topic_us(
+    horus: Any, size: Size, message: object, *, subscribers: int = 1, burst: int = 1
+) -> list[float]:
+    """Send and receive inside the ticks of a node; return the time per message of each tick [µs].
 
-    One publisher node sends ``TOPIC_BATCH`` messages per tick, each subscriber node receives all of
-    them in its own tick of the same cycle. A sample is the time per message: the publisher's share
-    plus that of every subscriber.
+    ``burst`` messages are sent, then every subscriber receives them all, and so on until
+    ``TOPIC_BATCH`` messages have passed: a burst of one is a round trip, a longer one lets the
+    queues grow. Publisher and subscribers are nodes of their own; the publisher's tick also calls
+    the subscribers' ``recv``, so that both sides are under one pair of clock readings.
     """
     topic = "bench.topic"
-    send_ns: list[int] = []
-    receive_ns: list[list[int]] = [[] for _ in range(subscribers)]
+    elapsed_ns: list[int] = []
     wrong = 0
 
-    def publish(node: Any) -> None:
+    def round_trips(node: Any) -> None:
+        nonlocal wrong
         send = node.send
+        received = None
         start_ns = now_ns()
         for _ in range(TOPIC_BATCH):
             send(topic, message)
-        send_ns.append(now_ns() - start_ns)
-
-    def make_subscriber(mine_ns: list[int]) -> Callable[[Any], None]:
-        def receive(node: Any) -> None:
-            nonlocal wrong
-            recv = node.recv
-            received = None
-            start_ns = now_ns()
-            for _ in range(TOPIC_BATCH):
+            for recv in receivers:
                 received = recv(topic)
-            mine_ns.append(now_ns() - start_ns)
-            wrong += received != message
+        elapsed_ns.append(now_ns() - start_ns)
+        wrong += received != message
 
-        return receive
+    def bursts(node: Any) -> None:
+        nonlocal wrong
+        send = node.send
+        received = None
+        start_ns = now_ns()
+        for _ in range(TOPIC_BATCH // burst):
+            for _ in range(burst):
+                send(topic, message)
+            for recv in receivers:
+                for _ in range(burst):
+                    received = recv(topic)
+        elapsed_ns.append(now_ns() - start_ns)
+        wrong += received != message
+
+    def idle(_node: Any) -> None:
+        """Leave receiving to the publisher's tick."""
 
     scheduler = horus.Scheduler(tick_rate=1000.0)
-    scheduler.add(
-        horus.Node(name="publisher", tick=publish, rate=TOPIC_RATE_HZ, order=0, pubs=[topic])
+    publisher = horus.Node(
+        name="publisher",
+        tick=round_trips if burst == 1 else bursts,
+        rate=TOPIC_RATE_HZ,
+        order=0,
+        pubs=[topic],
     )
-    for index, mine_ns in enumerate(receive_ns):
-        scheduler.add(
-            horus.Node(
-                name=f"subscriber{index}",
-                tick=make_subscriber(mine_ns),
-                rate=TOPIC_RATE_HZ,
-                order=1 + index,
-                subs=[topic],
-            )
+    scheduler.add(publisher)
+    nodes = [
+        horus.Node(
+            name=f"subscriber{index}", tick=idle, rate=TOPIC_RATE_HZ, order=1 + index, subs=[topic]
         )
+        for index in range(subscribers)
+    ]
+    receivers = [node.recv for node in nodes]
+    for node in nodes:
+        scheduler.add(node)
     # A scheduler may spend its first cycle on set-up without ticking anybody, and the first ticks
     # fill caches: they are run and thrown away.
     for _ in range(3):
         spin_for(TOPIC_GAP_S)
         scheduler.tick_once()
+    elapsed_ns.clear()
     wrong = 0
-    for series in (send_ns, *receive_ns):
-        series.clear()
     for _ in range(size.topic_ticks):
         spin_for(TOPIC_GAP_S)
         scheduler.tick_once()
-    if wrong or {len(series) for series in (send_ns, *receive_ns)} != {size.topic_ticks}:
+    if wrong or len(elapsed_ns) != size.topic_ticks:
         raise RuntimeError(
             f"topic workload did not run as written: {wrong} wrong messages, "
-            f"ticks {[len(send_ns), *map(len, receive_ns)]} of {size.topic_ticks}"
+            f"{len(elapsed_ns)} of {size.topic_ticks} ticks"
         )
-    per_message = 1e-3 / TOPIC_BATCH
-    return {
-        "round_trip_us": [
-            sum(sides) * per_message for sides in zip(send_ns, *receive_ns, strict=True)
-        ],
-        "send_us": [sample * per_message for sample in send_ns],
-    }
+    return [sample / TOPIC_BATCH / 1e3 for sample in elapsed_ns]
 
 
 def topics(horus: Any, size: Size) -> Series:
-    """Measure the topic round trip for each message and for five subscribers."""
-    cases = [(name, message, 1) for name, message in MESSAGES.items()]
-    cases.append(("dict3_to5", MESSAGES["dict3"], 5))
-    series: Series = {}
-    for case, message, subscribers in cases:
-        for name, samples in topic_round_trip(horus, size, message, subscribers).items():
-            series[f"{case}_{name}"] = samples
+    """Measure round trips of each message, to five subscribers, and bursts."""
+    dict3, scan360 = MESSAGES["dict3"], MESSAGES["scan360"]
+    series = {f"{name}_us": topic_us(horus, size, message) for name, message in MESSAGES.items()}
+    series["dict3_to5_us"] = topic_us(horus, size, dict3, subscribers=5)
+    series["dict3_burst_us"] = topic_us(horus, size, dict3, burst=TOPIC_BATCH)
+    series["scan360_burst_us"] = topic_us(horus, size, scan360, burst=TOPIC_BATCH)
     return series
 
 

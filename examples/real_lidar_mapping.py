@@ -4,7 +4,7 @@ The scans were taken by a robot driving two hours and 1.9 km through the corrido
 Killian Court. The log ships inside the package `rtb-data`, which comes with
 `pip install "horus-scheduler[examples]"`, and is read from there. Five nodes of four classes:
 
-    player    Rt, 200 Hz     publishes every scan at its recorded time divided by --speed
+    player    Rt, 100 Hz     publishes every scan at its recorded time divided by --speed
     filter    Event          removes beams without an echo and lone mixed-pixel echoes
     localiser Event          dead-reckons the odometry and chooses the pose of the scan
     mapper    Compute, 10 Hz casts every waiting scan into a log-odds grid, off the event loop
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 PACKAGE, LOG_ARCHIVE, LOG_NAME = "rtbdata", "data/killian.g2o.zip", "killian.g2o"
 N_BEAMS = 180
-PLAYER_RATE_HZ = 200
+PLAYER_RATE_HZ = 100
 MAPPER_RATE_HZ = 10
 DRAIN_TIME_S = 30.0  # how long the run may outlast the log before it counts as hung
 

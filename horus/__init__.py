@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from horus.clock import budget_remaining, dt, elapsed, now, rng_float, tick
 from horus.errors import (
     ConfigError,
@@ -17,11 +20,13 @@ from horus.errors import (
 )
 from horus.node import Node
 from horus.ports import Pub, Sub
-from horus.scheduler import Scheduler, run
 from horus.spec import ExecutionClass, FailurePolicy, Health, Miss, NodeState
 from horus.stats import NodeTiming, TimingReport
-from horus.stream import MessageStream
 from horus.units import ms, us
+
+if TYPE_CHECKING:
+    from horus.scheduler import Scheduler, run
+    from horus.stream import MessageStream
 
 __version__ = "0.1.0"
 
@@ -59,3 +64,20 @@ __all__ = [
     "tick",
     "us",
 ]
+
+# These bring in asyncio, which takes longer to import than all the rest: a
+# program that only describes nodes does not wait for it.
+_LAZY = {
+    "MessageStream": "horus.stream",
+    "Scheduler": "horus.scheduler",
+    "run": "horus.scheduler",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import the names that are loaded on first use."""
+    if name not in _LAZY:
+        raise AttributeError(f"module 'horus' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_LAZY[name]), name)
+    globals()[name] = value
+    return value

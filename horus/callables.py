@@ -10,7 +10,7 @@ from typing import Any
 Callback = Callable[..., Any]
 
 
-def is_async_callable(function: Callback) -> bool:
+def is_async_callable(function: Callback | None) -> bool:
     """Return whether calling `function` gives an awaitable by its declaration."""
     while isinstance(function, functools.partial):
         function = function.func

@@ -9,16 +9,19 @@ threads and `await` alike.
 
 from __future__ import annotations
 
-import random
+import os
 import time
 import weakref
 from collections.abc import Callable
 from contextvars import ContextVar
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from horus.stats import NodeCounters
 from horus.timing import ReleaseGrid
 from horus.units import NS_PER_S, to_s
+
+if TYPE_CHECKING:
+    import random
 
 monotonic_ns: Callable[[], int] = time.monotonic_ns
 """CLOCK_MONOTONIC [ns]: never jumps, not even when the wall clock is set."""
@@ -29,10 +32,16 @@ process_time_ns: Callable[[], int] = time.process_time_ns
 wall_ns: Callable[[], int] = time.time_ns
 """Wall clock [ns since 1970]: for stamping what people read, never for scheduling."""
 
+FOREVER_NS = 1 << 63
+"""An instant [ns] that does not come."""
+
 NEVER = -1
 """In place of an instant [ns] that has not come yet."""
 
-_system_random = random.SystemRandom()
+
+def _entropy_float() -> float:
+    """Return 53 random bits of the operating system as a float in [0, 1)."""
+    return (int.from_bytes(os.urandom(7)) >> 3) * 2.0**-53
 
 
 class Clock(Protocol):
@@ -85,6 +94,8 @@ class Timeline:
         self._paused_at: int | None = 0
         self._wall_offset_ns = 0 if self.deterministic else wall_ns() - monotonic_ns()
         self.started_ns: int | None = None
+        self.end_ns = FOREVER_NS
+        """The end of a run of limited time [ns]: no release at or after it."""
         self.grid = ReleaseGrid(self.now_ns(), tick_rate_hz)
 
     @property
@@ -97,8 +108,9 @@ class Timeline:
         """The instant of release 0 [ns]."""
         return self.grid.epoch_ns
 
-    def begin(self, epoch_ns: int) -> None:
+    def begin(self, epoch_ns: int, duration_ns: int | None = None) -> None:
         """Start the grid at `epoch_ns`; the cycle count goes on."""
+        self.end_ns = FOREVER_NS if duration_ns is None else epoch_ns + duration_ns
         if self.started_ns is None:
             self.started_ns = epoch_ns
         self._first_cycle = self.current_cycle()
@@ -202,9 +214,11 @@ class TickContext:
         """Return the next random float in [0, 1) of this tick."""
         seed = self.timeline.seed
         if seed is None:
-            return _system_random.random()
+            return _entropy_float()
         tick = self.counters.ticks
         if self.random is None or self.random[0] != tick:
+            import random  # only simulations need it, and it is slow to load
+
             # Seeded per tick, not per run: a node that draws once more in one
             # tick does not shift the numbers of every later tick.
             self.random = (tick, random.Random(f"{seed}/{self.node}/{tick}"))
@@ -306,4 +320,4 @@ def rng_float() -> float:
     Thread: any.
     """
     context = current.get()
-    return _system_random.random() if context is None else context.rng_float()
+    return _entropy_float() if context is None else context.rng_float()

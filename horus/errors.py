@@ -6,7 +6,18 @@ built here so that one mistake reads the same wherever it is made.
 
 from __future__ import annotations
 
+import sys
+import warnings
 from typing import Any
+
+
+def describe(value: Any, limit: int = 80) -> str:
+    """Return `repr(value)`, shortened, and never failing itself."""
+    try:
+        text = repr(value)
+    except Exception as exc:
+        text = f"<{type(value).__name__} whose repr raised {type(exc).__name__}>"
+    return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
 class HorusError(Exception):
@@ -18,7 +29,7 @@ class ConfigError(HorusError, ValueError):
 
     def __init__(self, argument: str, value: object, remedy: str) -> None:
         """Build the message `argument=value: remedy`."""
-        super().__init__(f"{argument}={value!r}: {remedy}")
+        super().__init__(f"{argument}={describe(value)}: {remedy}")
         self.argument = argument
         self.value = value
         self.remedy = remedy
@@ -77,10 +88,15 @@ class UnavailableWarning(HorusWarning):
     """A feature was asked for that this version does not provide."""
 
 
-def describe(value: Any, limit: int = 80) -> str:
-    """Return `repr(value)`, shortened, and never failing itself."""
-    try:
-        text = repr(value)
-    except Exception as exc:
-        text = f"<{type(value).__name__} whose repr raised {type(exc).__name__}>"
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+def warn_user(message: str, category: type[HorusWarning]) -> None:
+    """Warn at the line of the user's program that called into horus."""
+    level = 2
+    frame = sys._getframe(1)
+    while frame.f_back is not None and _is_ours(frame.f_globals.get("__name__", "")):
+        frame = frame.f_back
+        level += 1
+    warnings.warn(message, category, stacklevel=level)
+
+
+def _is_ours(module: str) -> bool:
+    return module == "horus" or module.startswith("horus.")

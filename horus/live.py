@@ -6,25 +6,25 @@ import asyncio
 import contextvars
 import inspect
 import logging
-from collections.abc import Awaitable
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from horus import clock
 from horus.clock import TickContext, Timeline
 from horus.errors import NodeError
+from horus.node import Node, core_of
 from horus.spec import ExecutionClass, FailurePolicy, Health, NodeSpec, NodeState
 from horus.stats import NodeCounters, NodeTiming
 from horus.timing import ReleaseGrid
 from horus.units import NS_PER_MS, NS_PER_S, readable, to_s
 
 if TYPE_CHECKING:
-    from horus.node import Node
     from horus.topics import Subscription
 
 NO_LIMIT_NS = 1 << 62
 FIRST_BACKOFF_NS = 100 * NS_PER_MS
 LONGEST_BACKOFF_NS = 5 * NS_PER_S
+_LONGEST_SILENCE_NS = 32 * NS_PER_S
 
 
 class Control(Protocol):
@@ -64,6 +64,7 @@ class LiveNode:
     def __init__(self, node: Node, timeline: Timeline, control: Control, sequence: int) -> None:
         """Put `node` into service as the `sequence`-th node added."""
         self.node = node
+        self.core = core = core_of(node)
         self.control = control
         self.timeline = timeline
         self.sequence = sequence
@@ -71,26 +72,25 @@ class LiveNode:
         self.state = NodeState.UNINITIALIZED
         self.health = Health.HEALTHY
         self.trigger: Subscription | None = None
-        self.publishes = frozenset(pub.topic for pub in node.pubs)
-        self.subscribes = frozenset(sub.topic for sub in node.subs)
-        self.tick_context = TickContext(node.name, timeline, self.counters)
+        self.publishes = frozenset(pub.topic for pub in core.pubs)
+        self.subscribes = frozenset(sub.topic for sub in core.subs)
+        self.tick_context = TickContext(core.spec.name, timeline, self.counters)
         self.context = contextvars.copy_context()
         self.context.run(clock.current.set, self.tick_context)
         self.gated = False
         """Whether a release must be admitted (`admit`) before it ticks."""
         self.retired = False
-        """Whether the node is leaving: it never ticks again."""
+        """Whether the node is out of service: no tick begins."""
+        self.removed = False
+        """Whether the node was taken from the scheduler for good."""
         self.skip_next = False
         self.in_episode = False
-        self.callbacks = {
-            phase: node.callback(phase) for phase in ("init", "tick", "shutdown", "safe_state")
-        }
-        self._hooks: set[asyncio.Future[None]] = set()
+        self.callbacks = core.callbacks
         self._restart_at_ns = 0
         self._backoff_ns = FIRST_BACKOFF_NS
         self._error_log = _Limiter()
         self._limit_log = _Limiter()
-        self.apply(node.spec)
+        self.apply(core.spec)
 
     # -- what it is --------------------------------------------------------------
 
@@ -103,6 +103,11 @@ class LiveNode:
     def order(self) -> int:
         """The node's execution order."""
         return self.spec.order
+
+    @property
+    def is_async(self) -> bool:
+        """Whether the node's tick is a coroutine function."""
+        return self.core.is_async
 
     @property
     def rank(self) -> tuple[int, int]:
@@ -148,9 +153,12 @@ class LiveNode:
 
     def run_phase(self, phase: str) -> bool:
         """Run a plain callback; return whether it succeeded. Never raises."""
-        error = None
+        error: BaseException | None = None
         try:
-            self.call(phase)
+            result = self.call(phase)
+            if inspect.iscoroutine(result):
+                result.close()
+                error = never_awaited(phase)
         except BaseException as exc:
             error = exc
         return self._phase_ended(phase, error)
@@ -177,28 +185,6 @@ class LiveNode:
             self._initialized_with(error is None)
         return error is None
 
-    def enter_safe_state(self) -> None:
-        """Call the safe-state hook, where the node's ticks run.
-
-        Thread: the node's own.
-        """
-        result = None
-        try:
-            result = self.call("safe_state")
-        except (Exception, SystemExit) as exc:
-            self.phase_failed("safe_state", exc)
-        if inspect.iscoroutine(result):
-            # Only async nodes have an async hook, and their ticks run on a loop.
-            task = asyncio.ensure_future(self._await_safe_state(result))
-            self._hooks.add(task)
-            task.add_done_callback(self._hooks.discard)
-
-    async def _await_safe_state(self, hook: Awaitable[Any]) -> None:
-        try:
-            await hook
-        except (Exception, SystemExit) as exc:
-            self.phase_failed("safe_state", exc)
-
     def phase_failed(self, phase: str, exc: BaseException) -> None:
         """Count, log and report an exception from `init`, `shutdown` or `safe_state`."""
         self.counters.errors += 1
@@ -207,17 +193,17 @@ class LiveNode:
 
     def notify_error(self, exc: BaseException) -> None:
         """Tell `on_error`; what it raises itself is logged and goes no further."""
-        if self.node.on_error is None:
+        if self.core.on_error is None:
             return
         try:
-            self.node.on_error(self.node, exc)
+            self.core.on_error(self.node, exc)
         except (Exception, SystemExit) as second:
             self.emit(logging.ERROR, f"on_error() raised {type(second).__name__}: {second}", second)
 
     def emit(self, level: int, message: str, exc: BaseException | None = None) -> None:
         """Log on the node's behalf."""
         extra = {"node": self.name, "cycle": self.tick_context.cycle()}
-        self.node.log.log(level, "%s", message, exc_info=exc, extra=extra)
+        self.core.log.log(level, "%s: %s", self.name, message, exc_info=exc, extra=extra)
 
     # -- life cycle --------------------------------------------------------------
 
@@ -295,12 +281,13 @@ class LiveNode:
     # -- trouble -----------------------------------------------------------------
 
     def tick_failed(self, exc: BaseException) -> None:
-        """Count, log (at most once a second) and report an exception from `tick`."""
+        """Count, log (rate limited) and report an exception from `tick`."""
         self.counters.errors += 1
-        due, others, _ = self._error_log.note(self.timeline.now_ns(), 0)
-        if due:
+        summary = self._error_log.note(self.timeline.now_ns(), 0)
+        if summary is not None:
             policy = self.spec.failure_policy
             quiet = policy is FailurePolicy.SKIP
+            others = summary.held_back
             more = f" ({others} more since the last message)" if others else ""
             self.emit(
                 logging.WARNING if quiet else logging.ERROR,
@@ -310,20 +297,20 @@ class LiveNode:
         self.notify_error(exc)
 
     def limit_exceeded(self, over_budget_ns: int, past_deadline_ns: int) -> str:
-        """Log an exceeded limit (at most once a second); return its description."""
+        """Log an exceeded limit (rate limited); return its description."""
         if past_deadline_ns > 0:
             over_ns, kind, limit_ns = past_deadline_ns, "deadline", self.deadline_ns
         else:
             over_ns, kind, limit_ns = over_budget_ns, "budget", self.budget_ns
         text = f"exceeded its {kind} of {readable(limit_ns)} by {readable(over_ns)}"
-        due, others, worst_ns = self._limit_log.note(self.timeline.now_ns(), over_ns)
-        if due and others:
+        summary = self._limit_log.note(self.timeline.now_ns(), over_ns)
+        if summary is not None and summary.held_back:
             self.emit(
                 logging.WARNING,
-                f"{others + 1} ticks exceeded their limits since the last message, "
-                f"worst {readable(worst_ns)} over",
+                f"{summary.held_back + 1} ticks exceeded their limits in the last "
+                f"{readable(summary.period_ns)}, worst {readable(summary.worst)} over",
             )
-        elif due:
+        elif summary is not None:
             self.emit(logging.WARNING, text)
         return text
 
@@ -353,6 +340,14 @@ class LiveNode:
         )
 
 
+def never_awaited(phase: str) -> TypeError:
+    """Return the error of a plain callback that returns a coroutine."""
+    return TypeError(
+        f"{phase}() returned a coroutine that nobody would await; declare it with `async def`, "
+        "or pass the coroutine function itself instead of a function that calls it"
+    )
+
+
 def being_cancelled() -> bool:
     """Return whether the current task was asked to end, as opposed to code that raises at will."""
     task = asyncio.current_task()
@@ -360,20 +355,36 @@ def being_cancelled() -> bool:
 
 
 class _Limiter:
-    """Lets one message a second through and counts the others."""
+    """Lets a message through now and then, ever more rarely while the trouble lasts."""
 
     def __init__(self) -> None:
-        self._next_ns: int | None = None
+        self._last_ns = 0
+        self._pause_ns = 0
         self._held_back = 0
         self._worst = 0
 
-    def note(self, now_ns: int, size: int) -> tuple[bool, int, int]:
-        """Return (whether to log now, how many were held back, the worst size)."""
+    def note(self, now_ns: int, size: int) -> Summary | None:
+        """Return what to log now, or None to hold it back."""
         self._worst = max(self._worst, size)
-        if self._next_ns is not None and now_ns < self._next_ns:
+        waited_ns = now_ns - self._last_ns
+        if waited_ns < self._pause_ns:
             self._held_back += 1
-            return False, self._held_back, self._worst
-        held_back, worst = self._held_back, self._worst
-        self._next_ns = now_ns + NS_PER_S
+            return None
+        if waited_ns > 2 * self._pause_ns:
+            self._pause_ns = 0
+        summary = Summary(self._held_back, self._worst, waited_ns)
+        self._pause_ns = min(max(NS_PER_S, 2 * self._pause_ns), _LONGEST_SILENCE_NS)
+        self._last_ns = now_ns
         self._held_back = self._worst = 0
-        return True, held_back, worst
+        return summary
+
+
+class Summary(NamedTuple):
+    """What a message stands for besides itself."""
+
+    held_back: int
+    """Occurrences since the last message that were not logged."""
+    worst: int
+    """The largest size among them and this one."""
+    period_ns: int
+    """Time since the last message [ns]."""

@@ -27,15 +27,13 @@ def visible(*, install: bool, verbose: bool) -> Iterator[None]:
         verbose: Whether debug messages are shown; otherwise from info on.
     """
     level = _root.level
+    installs = install and not _root.hasHandlers()
     if verbose:
         _root.setLevel(logging.DEBUG)
-    elif install and level == logging.NOTSET:
+    elif installs and level == logging.NOTSET:
         _root.setLevel(logging.INFO)
     try:
-        if install and not _root.hasHandlers():
-            with _stderr_handler():
-                yield
-        else:
+        with _stderr_handler() if installs else contextlib.nullcontext():
             yield
     finally:
         _root.setLevel(level)
@@ -69,15 +67,16 @@ def flush(timeout_s: float = 0.5) -> None:
 
 
 class _Formatter(logging.Formatter):
-    """`12:34:56.789 WARNING motor @1234: message`."""
+    """`12:34:56.789 WARNING @1234 motor: message`."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         """Put a record on one line; exceptions follow below."""
         time_of_day = self.formatTime(record, "%H:%M:%S")
         source = record.name.removeprefix("horus.node.").removeprefix("horus.")
         cycle = getattr(record, "cycle", None)
-        where = source if cycle is None else f"{source} @{cycle}"
-        return (
-            f"{time_of_day}.{int(record.msecs):03d} {record.levelname:<7} {where}: "
-            f"{record.getMessage()}"
-        )
+        when = "" if cycle is None else f"@{cycle} "
+        # What horus says about a node names it already, for handlers that show
+        # nothing but the message.
+        message = record.getMessage()
+        named = message if message.startswith(f"{source}: ") else f"{source}: {message}"
+        return f"{time_of_day}.{int(record.msecs):03d} {record.levelname:<7} {when}{named}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from horus import clock
@@ -31,7 +31,7 @@ class Node:
         Node("motor", tick=drive, rate=1000, order=20, budget=300 * us, subs=["cmd"])
 
     or subclass, with methods `tick`, `init`, `shutdown` and `enter_safe_state`
-    (each optional but `tick`). A callback may take the node or nothing.
+    (each optional but `tick`) and `on_error`. A callback may take the node or nothing.
     """
 
     def __init__(
@@ -93,19 +93,20 @@ class Node:
             ConfigError: An argument was refused; the message names it.
             TopicError: A topic name was refused.
         """
-        self._tick = self._pick("tick", tick)
-        if self._tick is None:
+        callbacks = {
+            "tick": self.__pick("tick", tick),
+            "init": self.__pick("init", init),
+            "shutdown": self.__pick("shutdown", shutdown),
+            "safe_state": self.__pick("safe_state", safe_state, method="enter_safe_state"),
+            "on_error": self.__pick("on_error", on_error),
+        }
+        if callbacks["tick"] is None:
             raise ConfigError("tick", tick, "a node needs a tick function or a tick() method")
-        self._init = self._pick("init", init)
-        self._shutdown = self._pick("shutdown", shutdown)
-        self._safe_state = self._pick("safe_state", safe_state, method="enter_safe_state")
-        if on_error is not None and not callable(on_error):
-            raise ConfigError("on_error", on_error, "must be callable as on_error(node, exception)")
-        self.on_error = on_error
-        self.is_async = is_async_callable(self._tick)
-        self.spec: NodeSpec = make_node_spec(
+        is_async = is_async_callable(callbacks["tick"])
+        _refuse_stray_async(callbacks, is_async)
+        spec = make_node_spec(
             name=name,
-            is_async=self.is_async,
+            is_async=is_async,
             rate=rate,
             order=order,
             budget=budget,
@@ -118,48 +119,48 @@ class Node:
             core=core,
             watchdog=watchdog,
         )
-        self._refuse_stray_async()
-        self.pubs: tuple[Pub, ...] = declared("pubs", pubs, Pub)
-        self.subs: tuple[Sub, ...] = declared("subs", subs, Sub)
-        self.log = logging.getLogger(f"horus.node.{self.spec.name}")
-        self.owner: object | None = None
-        self.request_stop_hook: Callable[[str], None] | None = None
-        self._bus: Bus | None = None
-        self._outputs: dict[Any, Publisher] = {}
-        self._inputs: dict[Any, Subscription] = {}
-        self._warned_outside = False
+        # Mangled names: a driver class that calls its own things `connect`, `log`
+        # or `_inputs` must not take the machinery apart.
+        self.__core = NodeCore(
+            self, spec, callbacks, declared("pubs", pubs, Pub), declared("subs", subs, Sub)
+        )
+        self.__outputs = self.__core.outputs
+        self.__inputs = self.__core.inputs
+        self.__warned_outside = False
 
     # -- configuration, as the contract names it -------------------------------
 
     @property
     def name(self) -> str:
         """The name."""
-        return self.spec.name
+        return self.__core.spec.name
 
     @property
     def rate(self) -> float:
         """The rate [Hz]; 30 when not given."""
-        return self.spec.rate_hz
+        return self.__core.spec.rate_hz
 
     @property
     def order(self) -> int:
         """The execution order; 100 when not given."""
-        return self.spec.order
+        return self.__core.spec.order
 
     @property
     def budget(self) -> float | None:
         """The budget [s], given or derived."""
-        return None if self.spec.budget_ns is None else to_s(self.spec.budget_ns)
+        budget_ns = self.__core.spec.budget_ns
+        return None if budget_ns is None else to_s(budget_ns)
 
     @property
     def deadline(self) -> float | None:
         """The deadline [s], given or derived."""
-        return None if self.spec.deadline_ns is None else to_s(self.spec.deadline_ns)
+        deadline_ns = self.__core.spec.deadline_ns
+        return None if deadline_ns is None else to_s(deadline_ns)
 
     @property
     def execution_class(self) -> ExecutionClass:
         """The execution class that the configuration implies."""
-        return self.spec.execution_class
+        return self.__core.spec.execution_class
 
     # -- messages ---------------------------------------------------------------
 
@@ -173,9 +174,9 @@ class Node:
         Thread: the node's own callbacks.
         """
         try:
-            publisher = self._outputs[topic]
+            publisher = self.__outputs[topic]
         except KeyError:
-            publisher = self._open_output(topic)
+            publisher = self.__core.open_output(topic)
         publisher.send(message)
 
     def recv(self, topic: str | type) -> Any:
@@ -184,25 +185,25 @@ class Node:
         Thread: the node's own callbacks.
         """
         try:
-            subscription = self._inputs[topic]
+            subscription = self.__inputs[topic]
         except KeyError:
-            subscription = self._open_input(topic)
+            subscription = self.__core.open_input(topic)
         return subscription.take()
 
     def recv_all(self, topic: str | type) -> list[Any]:
         """Return every message that waits, oldest first."""
-        return self._input(topic).take_all()
+        return self.__input(topic).take_all()
 
     def has_msg(self, topic: str | type) -> bool:
         """Return whether a message waits."""
         try:
-            return bool(self._inputs[topic].queue)
+            return bool(self.__inputs[topic].queue)
         except KeyError:
-            return bool(self._open_input(topic).queue)
+            return bool(self.__core.open_input(topic).queue)
 
     def latest(self, topic: str | type) -> Any:
         """Return the topic's newest message, received or not; None before the first."""
-        return self._input(topic).topic.latest()
+        return self.__input(topic).topic.latest()
 
     # -- control and logging ----------------------------------------------------
 
@@ -211,78 +212,40 @@ class Node:
 
         Thread: any.
         """
-        if self.request_stop_hook is None:
+        request_stop = self.__core.request_stop
+        if request_stop is None:
             raise StateError(f"node {self.name!r} was not added to a scheduler")
-        self.request_stop_hook(reason or f"requested by node {self.name!r}")
+        request_stop(reason or f"requested by node {self.name!r}")
 
     def log_debug(self, message: str, *args: object) -> None:
         """Log at debug level to `horus.node.<name>`; dropped outside callbacks."""
-        self._emit(logging.DEBUG, message, args)
+        self.__emit(logging.DEBUG, message, args)
 
     def log_info(self, message: str, *args: object) -> None:
         """Log at info level; see `log_debug`."""
-        self._emit(logging.INFO, message, args)
+        self.__emit(logging.INFO, message, args)
 
     def log_warning(self, message: str, *args: object) -> None:
         """Log at warning level; see `log_debug`."""
-        self._emit(logging.WARNING, message, args)
+        self.__emit(logging.WARNING, message, args)
 
     def log_error(self, message: str, *args: object) -> None:
         """Log at error level; see `log_debug`."""
-        self._emit(logging.ERROR, message, args)
+        self.__emit(logging.ERROR, message, args)
 
     def __repr__(self) -> str:
         """Show what the node is and how it is scheduled."""
-        spec = self.spec
+        spec = self.__core.spec
         when = f"on={spec.on!r}" if spec.on else f"rate={spec.rate_hz:g}"
         return f"<Node {spec.name!r} {spec.execution_class} {when} order={spec.order}>"
 
-    # -- for the scheduler ------------------------------------------------------
+    # -- internals ----------------------------------------------------------------
 
-    def callback(self, phase: str) -> Callable[[], Any] | None:
-        """Return the callback of a phase as a call without arguments, if there is one."""
-        function = {
-            "tick": self._tick,
-            "init": self._init,
-            "shutdown": self._shutdown,
-            "safe_state": self._safe_state,
-        }[phase]
-        if function is None or not takes_node(function):
-            return function
-        return functools.partial(function, self)
-
-    def connect(self, bus: Bus) -> Subscription | None:
-        """Open the declared ports on a bus; return the trigger of an event node.
-
-        Raises:
-            ConfigError: A topic was declared with another type before.
-        """
-        for port in (*self.pubs, *self.subs):
-            bus.topic(port.topic).declare_type(port.type, self.name)
-        self._bus = bus
-        self._outputs = {pub.topic: bus.topic(pub.topic).publisher(self.name) for pub in self.pubs}
-        self._inputs = {
-            sub.topic: bus.subscribe(sub.topic, self.name, sub.capacity) for sub in self.subs
-        }
-        on = self.spec.on
-        if on is None:
-            return None
-        if on not in self._inputs:
-            self._inputs[on] = bus.subscribe(on, self.name)
-        return self._inputs[on]
-
-    def disconnect(self) -> None:
-        """Stop receiving; what was sent stays counted."""
-        for subscription in self._inputs.values():
-            subscription.close()
-
-    # -- internals --------------------------------------------------------------
-
-    def _pick(
+    def __pick(
         self, argument: str, function: Callback | None, method: str | None = None
     ) -> Callback | None:
-        own = getattr(type(self), method or argument, None)
-        if own is None:
+        """Return a callback from the argument or the method of the class, not both."""
+        if getattr(type(self), method or argument, None) is None:
             if function is not None and not callable(function):
                 raise ConfigError(argument, function, "must be callable")
             return function
@@ -291,71 +254,161 @@ class Node:
         bound: Callback = getattr(self, method or argument)
         return bound
 
-    def _refuse_stray_async(self) -> None:
-        for argument, function in (
-            ("init", self._init),
-            ("shutdown", self._shutdown),
-            ("safe_state", self._safe_state),
-        ):
-            if function is not None and is_async_callable(function) and not self.is_async:
-                raise ConfigError(
-                    argument,
-                    function,
-                    "is async, but tick is not: only nodes with an async tick run on the "
-                    "event loop; make both async or neither",
-                )
+    def __input(self, topic: str | type) -> Subscription:
+        return self.__inputs.get(topic) or self.__core.open_input(topic)
 
-    def _input(self, topic: str | type) -> Subscription:
-        return self._inputs.get(topic) or self._open_input(topic)
-
-    def _open_output(self, topic: str | type) -> Publisher:
-        bus = self._connected_bus()
-        found = bus.topic(topic)
-        publisher = self._outputs.get(found.name)
-        if publisher is None:
-            publisher = self._outputs[found.name] = found.publisher(self.name)
-            self._warn_undeclared("sends to", "pubs", found.name)
-        self._outputs[topic] = publisher
-        return publisher
-
-    def _open_input(self, topic: str | type) -> Subscription:
-        bus = self._connected_bus()
-        found = bus.topic(topic)
-        subscription = self._inputs.get(found.name)
-        if subscription is None:
-            subscription = self._inputs[found.name] = bus.subscribe(found.name, self.name)
-            self._warn_undeclared("receives from", "subs", found.name)
-        self._inputs[topic] = subscription
-        return subscription
-
-    def _connected_bus(self) -> Bus:
-        if self._bus is None:
-            raise StateError(f"node {self.name!r} must be added to a scheduler to use topics")
-        return self._bus
-
-    def _warn_undeclared(self, verb: str, argument: str, topic: str) -> None:
-        _log.warning(
-            "%s %s topic %r, which it did not declare; add %s=[%r] so that the "
-            "scheduler knows the graph and nothing sent before is missed",
-            self.name,
-            verb,
-            topic,
-            argument,
-            topic,
-        )
-
-    def _emit(self, level: int, message: str, args: tuple[object, ...]) -> None:
+    def __emit(self, level: int, message: str, args: tuple[object, ...]) -> None:
         context = clock.current.get()
+        log = self.__core.log
         if context is None:
-            if not self._warned_outside:
-                self._warned_outside = True
+            if not self.__warned_outside:
+                self.__warned_outside = True
                 _log.warning(
                     "%s logs outside init, tick and shutdown; such messages are dropped "
                     "(this is said once): %s",
                     self.name,
                     describe(message),
                 )
-            return
-        if self.log.isEnabledFor(level):
+        elif log.isEnabledFor(level):
             extra = {"node": self.name, "cycle": context.cycle()}
-            self.log.log(level, message, *args, extra=extra, stacklevel=3)
+            log.log(level, message, *args, extra=extra, stacklevel=3)
+
+    @staticmethod
+    def _core_of(node: Node) -> NodeCore | None:
+        """Return what the scheduler knows of a node; None if it was never initialised."""
+        return getattr(node, "_Node__core", None)
+
+
+class NodeCore:
+    """What the scheduler knows of a node: configuration, callbacks, open ports."""
+
+    def __init__(
+        self,
+        node: Node,
+        spec: NodeSpec,
+        functions: Mapping[str, Callback | None],
+        pubs: tuple[Pub, ...],
+        subs: tuple[Sub, ...],
+    ) -> None:
+        """Describe a node that belongs to no scheduler yet."""
+        self.node = node
+        self.spec = spec
+        self.pubs = pubs
+        self.subs = subs
+        self.is_async = is_async_callable(functions["tick"])
+        self.on_error: ErrorCallback | None = functions["on_error"]
+        self.callbacks = {
+            phase: _without_arguments(functions[phase], node)
+            for phase in ("init", "tick", "shutdown", "safe_state")
+        }
+        self.log = logging.getLogger(f"horus.node.{spec.name}")
+        self.owner: object | None = None
+        self.request_stop: Callable[[str], None] | None = None
+        self.outputs: dict[Any, Publisher] = {}
+        self.inputs: dict[Any, Subscription] = {}
+        self._bus: Bus | None = None
+
+    @property
+    def dropped(self) -> int:
+        """How many messages its queues have lost."""
+        return sum(subscription.dropped for subscription in set(self.inputs.values()))
+
+    def connect(self, bus: Bus) -> Subscription | None:
+        """Open the declared ports on a bus; return the trigger of an event node.
+
+        Raises:
+            ConfigError: A topic was declared with another type before.
+        """
+        for port in (*self.pubs, *self.subs):
+            bus.topic(port.topic).declare_type(port.type, self.spec.name)
+        self.disconnect()
+        self._bus = bus
+        for pub in self.pubs:
+            self.outputs[pub.topic] = bus.topic(pub.topic).publisher(self.spec.name)
+        for sub in self.subs:
+            self.inputs[sub.topic] = bus.subscribe(sub.topic, self.spec.name, sub.capacity)
+        on = self.spec.on
+        if on is None:
+            return None
+        if on not in self.inputs:
+            self.inputs[on] = bus.subscribe(on, self.spec.name)
+        return self.inputs[on]
+
+    def disconnect(self) -> None:
+        """Close the ports; what was sent stays counted."""
+        for subscription in self.inputs.values():
+            subscription.close()
+        self.inputs.clear()
+        self.outputs.clear()
+
+    def open_output(self, topic: str | type) -> Publisher:
+        """Open a topic for sending that was not declared, or under another key."""
+        found = self._connected_bus().topic(topic)
+        publisher = self.outputs.get(found.name)
+        if publisher is None:
+            publisher = self.outputs[found.name] = found.publisher(self.spec.name)
+            self._warn_undeclared("sends to", "pubs", found.name)
+        self.outputs[topic] = publisher
+        return publisher
+
+    def open_input(self, topic: str | type) -> Subscription:
+        """Open a topic for receiving that was not declared, or under another key."""
+        bus = self._connected_bus()
+        found = bus.topic(topic)
+        subscription = self.inputs.get(found.name)
+        if subscription is None:
+            subscription = self.inputs[found.name] = bus.subscribe(found.name, self.spec.name)
+            self._warn_undeclared("receives from", "subs", found.name)
+        self.inputs[topic] = subscription
+        return subscription
+
+    def _connected_bus(self) -> Bus:
+        if self._bus is None:
+            raise StateError(f"node {self.spec.name!r} must be added to a scheduler to use topics")
+        return self._bus
+
+    def _warn_undeclared(self, verb: str, argument: str, topic: str) -> None:
+        _log.warning(
+            "%s %s topic %r, which it did not declare; add %s=[%r] so that the "
+            "scheduler knows the graph and nothing sent before is missed",
+            self.spec.name,
+            verb,
+            topic,
+            argument,
+            topic,
+        )
+
+
+def core_of(node: object) -> NodeCore:
+    """Return what the scheduler knows of a node.
+
+    Raises:
+        ConfigError: Not a node, or a subclass that did not call `super().__init__()`.
+    """
+    core = Node._core_of(node) if isinstance(node, Node) else None
+    if core is None:
+        raise ConfigError(
+            "node", node, "must be a Node; a subclass must call super().__init__(name, ...)"
+        )
+    return core
+
+
+def _without_arguments(function: Callback | None, node: Node) -> Callable[[], Any] | None:
+    if function is None or not takes_node(function):
+        return function
+    return functools.partial(function, node)
+
+
+def _refuse_stray_async(callbacks: Mapping[str, Callback | None], is_async: bool) -> None:
+    for argument, function in callbacks.items():
+        if function is None or argument == "tick" or not is_async_callable(function):
+            continue
+        if argument == "on_error":
+            raise ConfigError(argument, function, "must be a plain function; nobody awaits it")
+        if not is_async:
+            raise ConfigError(
+                argument,
+                function,
+                "is async, but tick is not: only nodes with an async tick run on the "
+                "event loop; make both async or neither",
+            )

@@ -41,7 +41,7 @@ class Registry:
                     "name", node.name, "is taken by another node; names must be unique"
                 )
             live = LiveNode(node, self._timeline, control, self._added)
-            live.trigger = node.connect(self._bus)
+            live.trigger = live.core.connect(self._bus)
             self._added += 1
             self._by_name[node.name] = live
             self._sort()
@@ -91,7 +91,8 @@ class Registry:
 
     def timing_report(self, now_ns: int) -> TimingReport:
         """Return a report on all nodes; `now_ns` is 0 when nothing runs."""
-        return TimingReport(tuple(live.timing(now_ns) for live in self.in_order))
+        rows = tuple(live.timing(now_ns) for live in self.in_order)
+        return TimingReport(rows, virtual=self._timeline.deterministic)
 
     def safety_stats(self) -> dict[str, Any]:
         """Return the sums of what went wrong, and each node's health."""
@@ -126,6 +127,7 @@ def node_stats(live: LiveNode, now_ns: int) -> dict[str, Any]:
         "budget_overruns": counters.budget_overruns,
         "deadline_misses": counters.deadline_misses,
         "skipped": counters.skipped,
+        "dropped": live.core.dropped,
         "watchdog_expirations": counters.watchdog_expirations,
         "avg_tick_duration": timing.execution_avg_s,
         "p99_tick_duration": timing.execution_p99_s,

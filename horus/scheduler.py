@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from horus import unavailable
 from horus.errors import ConfigError, StateError
-from horus.node import Node
+from horus.node import Node, NodeCore, core_of
 from horus.ports import DEFAULT_CAPACITY
 from horus.registry import node_stats
 from horus.session import Session
@@ -106,15 +106,12 @@ class Scheduler:
             ConfigError: Not a node, or the name is taken.
             StateError: The node is in use by another scheduler that runs.
         """
-        if not isinstance(node, Node) or not hasattr(node, "spec"):
-            raise ConfigError(
-                "node", node, "must be a Node; a subclass must call super().__init__(name, ...)"
-            )
-        self._take_over(node)
+        core = core_of(node)
+        self._take_over(core)
         live = self._registry.add(node, self._session.control)
-        node.owner = self
-        node.request_stop_hook = self._session.control.request_stop
-        unavailable.warn_of_node(node.spec)
+        core.owner = self
+        core.request_stop = self._session.control.request_stop
+        unavailable.warn_of_node(core.spec)
         self._session.joined(live)
         return self
 
@@ -132,8 +129,8 @@ class Scheduler:
         if live is None:
             return False
         self._session.leave(live)
-        live.node.disconnect()
-        live.node.owner = None
+        live.core.disconnect()
+        live.core.owner = None
         return True
 
     def set_node_rate(self, name: str, rate: float) -> None:
@@ -423,16 +420,16 @@ class Scheduler:
 
     # -- internals -------------------------------------------------------------------
 
-    def _take_over(self, node: Node) -> None:
+    def _take_over(self, core: NodeCore) -> None:
         """Take a node from the scheduler it was in before."""
-        owner = node.owner
+        owner = core.owner
         if isinstance(owner, Scheduler) and owner is not self:
             if owner.is_running():
                 raise StateError(
-                    f"node {node.name!r} is in use by scheduler {owner.scheduler_name()!r}, "
+                    f"node {core.spec.name!r} is in use by scheduler {owner.scheduler_name()!r}, "
                     "which is running; remove it there first"
                 )
-            owner.remove_node(node.name)
+            owner.remove_node(core.spec.name)
 
 
 def run(*nodes: Node, duration: float | None = None, **options: Any) -> None:

@@ -13,6 +13,7 @@ from horus.errors import NodeError, ShutdownTimeout, StateError
 from horus.executors import make_executors
 from horus.live import LiveNode
 from horus.loop.control import RunControl
+from horus.loop.private_loop import StepLoop
 from horus.loop.runtime import Runtime
 from horus.loop.signals import stop_on_signals
 from horus.loop.simulation import Simulation
@@ -91,13 +92,18 @@ class Session:
                 self._simulate(duration_ns, only)
                 return
             runtime = self._start_runtime()
-            lives = self.registry.in_order if only is None else only
-            work = runtime.run(lives, _seconds(duration_ns), shut_down_after=not keeps_open)
+            loop = StepLoop(_loop_factory(self._spec.loop)())
             try:
-                with asyncio.Runner(loop_factory=_loop_factory(self._spec.loop)) as runner:
-                    runner.run(work)
+                loop.run(
+                    runtime.run(
+                        lambda: self.registry.in_order if only is None else only,
+                        duration_ns,
+                        shut_down_after=not keeps_open,
+                    )
+                )
             finally:
                 self._runtime = None
+                loop.close()
 
     async def arun(self, duration_ns: int | None) -> None:
         """Run on the running event loop until stopped, cancelled, or for a time [ns]."""
@@ -107,7 +113,7 @@ class Session:
                 return
             runtime = self._start_runtime()
             try:
-                await runtime.run(self.registry.in_order, _seconds(duration_ns))
+                await runtime.run(lambda: self.registry.in_order, duration_ns)
             finally:
                 self._runtime = None
 
@@ -310,7 +316,3 @@ def _loop_factory(kind: str) -> Callable[[], asyncio.AbstractEventLoop]:
     except ImportError:  # not made for Windows
         return asyncio.new_event_loop
     return uvloop.new_event_loop
-
-
-def _seconds(duration_ns: int | None) -> float | None:
-    return None if duration_ns is None else to_s(duration_ns)

@@ -6,11 +6,10 @@ everything below works on the integers.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from horus.errors import ConfigError, ConfigWarning
+from horus.errors import ConfigError, ConfigWarning, warn_user
 from horus.timing import period_ns
 from horus.units import NS_PER_MS, NS_PER_S, readable
 from horus.validation import (
@@ -242,18 +241,17 @@ def _warn_about_units(spec: NodeSpec) -> None:
     for argument, limit_ns in (("budget", spec.budget_ns), ("deadline", spec.deadline_ns)):
         if limit_ns is None:
             continue
-        too_long = spec.rate_given and limit_ns > spec.period_ns
+        too_long = spec.rate_given and limit_ns > spec.period_ns + 1
         if too_long or limit_ns > _SUSPICIOUS_LIMIT_NS:
             beyond = (
                 f"longer than its period of {readable(spec.period_ns)}"
                 if too_long
                 else "over a minute"
             )
-            warnings.warn(
+            warn_user(
                 f"node {spec.name!r}: {argument} is {readable(limit_ns)}, {beyond}; "
                 f"limits are in seconds, write {argument}=300 * us for 300 microseconds",
                 ConfigWarning,
-                stacklevel=5,
             )
 
 

@@ -169,6 +169,8 @@ class TimingReport:
     """How well each node kept its schedule; `str()` of it is a table."""
 
     rows: tuple[NodeTiming, ...]
+    virtual: bool = False
+    """Whether the times are simulated: a tick takes none but what it awaits."""
 
     def __str__(self) -> str:
         """Lay the rows out as a table, durations in milliseconds."""
@@ -180,6 +182,8 @@ class TimingReport:
             right = [cell.rjust(width) for cell, width in zip(line[2:], widths[2:], strict=True)]
             lines.append("  ".join([*left, *right]).rstrip())
         lines.insert(1, "-" * max(len(line) for line in lines))
+        if self.virtual:
+            lines.append("(virtual time: a tick takes none but what it awaits)")
         return "\n".join(lines)
 
 

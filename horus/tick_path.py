@@ -22,7 +22,7 @@ from typing import Any
 
 from horus.errors import NodeError
 from horus.escalation import Action, Outcome, decide
-from horus.live import Admission, LiveNode, being_cancelled
+from horus.live import Admission, LiveNode, being_cancelled, never_awaited
 
 RunTick = Callable[[int], None]
 RunTickAsync = Callable[[int], Coroutine[Any, Any, None]]
@@ -49,13 +49,14 @@ def build_tick(live: LiveNode) -> RunTick:
             result = run_in_context(callback)
             if result is not None and inspect.iscoroutine(result):
                 result.close()
-                error = _not_declared_async()
+                error = never_awaited("tick")
         except BaseException as exc:
             if _is_interrupt(exc):
                 live.control.request_stop("KeyboardInterrupt")
                 raise
             error = exc
-        finish(release_ns, start_ns, error)
+        if finish(release_ns, start_ns, error):
+            live.run_phase("safe_state")
         # The exception's traceback refers to this frame: let go of it, or each
         # failed tick leaves a cycle to the garbage collector.
         error = None
@@ -92,7 +93,8 @@ def build_async_tick(live: LiveNode) -> RunTickAsync:
             error = exc
         except BaseException as exc:
             error = exc
-        finish(release_ns, start_ns, error)
+        if finish(release_ns, start_ns, error):
+            live.run_phase("safe_state")
         # The exception's traceback refers to this frame: let go of it, or each
         # failed tick leaves a cycle to the garbage collector.
         error = None
@@ -100,15 +102,15 @@ def build_async_tick(live: LiveNode) -> RunTickAsync:
     return run_tick
 
 
-def _build_finish(live: LiveNode) -> Callable[[int, int, BaseException | None], None]:
+def _build_finish(live: LiveNode) -> Callable[[int, int, BaseException | None], bool]:
+    """Return steps 4 and 5, which tell whether the safe-state hook is to be called."""
     now_ns = live.timeline.now_ns
     context = live.tick_context
     counters = live.counters
     add_times = counters.times.add
 
-    def finish(release_ns: int, start_ns: int, error: BaseException | None) -> None:
+    def finish(release_ns: int, start_ns: int, error: BaseException | None) -> bool:
         finish_ns = now_ns()
-        context.ticking = False
         execution_ns = finish_ns - start_ns
         counters.ticks += 1
         if counters.first_release_ns is None:
@@ -118,15 +120,19 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, BaseException | None], 
         over_budget_ns = execution_ns - live.budget_ns
         past_deadline_ns = finish_ns - release_ns - live.deadline_ns
         if over_budget_ns > 0 or past_deadline_ns > 0 or error is not None or live.in_episode:
-            _settle(live, over_budget_ns, past_deadline_ns, error)
+            enter_safe_state = _settle(live, over_budget_ns, past_deadline_ns, error)
+            context.ticking = False
+            return enter_safe_state
+        context.ticking = False
+        return False
 
     return finish
 
 
 def _settle(
     live: LiveNode, over_budget_ns: int, past_deadline_ns: int, error: BaseException | None
-) -> None:
-    """Count what went wrong, decide what follows and do it."""
+) -> bool:
+    """Count what went wrong, decide what follows and do it; see `_build_finish`."""
     counters = live.counters
     outcome = Outcome(max(0, over_budget_ns), max(0, past_deadline_ns), error is not None)
     action = decide(
@@ -144,6 +150,7 @@ def _settle(
         counters.deadline_misses += 1
         live.control.count_miss()
     _act(live, outcome, action, error)
+    return action.enter_safe_state
 
 
 def _act(live: LiveNode, outcome: Outcome, action: Action, error: BaseException | None) -> None:
@@ -151,8 +158,6 @@ def _act(live: LiveNode, outcome: Outcome, action: Action, error: BaseException 
         text = live.limit_exceeded(outcome.over_budget_ns, outcome.past_deadline_ns)
         if action.stop:
             live.control.request_stop(f"node {live.name!r} {text}")
-    if action.enter_safe_state:
-        live.enter_safe_state()
     if action.skip_next:
         live.skip_next = live.gated = True
     if action.fatal and error is not None:
@@ -187,13 +192,6 @@ def _counted(live: LiveNode, admission: Admission) -> bool:
     if admission is Admission.SKIP:
         live.counters.skipped += 1
     return admission is Admission.TICK
-
-
-def _not_declared_async() -> TypeError:
-    return TypeError(
-        "tick() returned a coroutine that nobody would await; declare it with `async def`, "
-        "or pass the coroutine function itself instead of a function that calls it"
-    )
 
 
 def _is_interrupt(exc: BaseException) -> bool:

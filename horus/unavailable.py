@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import NoReturn
 
-from horus.errors import StateError, UnavailableWarning
+from horus.errors import StateError, UnavailableWarning, warn_user
 from horus.spec import NodeSpec, SchedulerSpec
 
 
@@ -35,10 +34,8 @@ def warn_of_node(spec: NodeSpec) -> None:
 
 
 def warn(feature: str, consequence: str) -> None:
-    """Warn that a feature has no effect, at the caller's caller's caller."""
-    warnings.warn(
-        f"{feature} is not part of this version: {consequence}", UnavailableWarning, stacklevel=4
-    )
+    """Warn that a feature has no effect."""
+    warn_user(f"{feature} is not part of this version: {consequence}", UnavailableWarning)
 
 
 def refuse_recording(what: str) -> NoReturn:

@@ -1,7 +1,8 @@
 """Miss one deadline under each of the four `on_miss` policies.
 
-The third tick lasts 30 ms, the deadline is 20 ms, the period 50 ms. "skip" drops the release after it, "safe_mode" calls
-the node's safe-state hook, "stop" ends the run. The numbers of ticks vary with the machine's load.
+The third tick lasts 30 ms; the deadline is 20 ms, the period 50 ms. "skip" drops the release
+after it, "safe_mode" calls the node's safe-state hook, "stop" ends the run. The numbers of ticks
+vary with the machine's load.
 
 Prints:
     warn       ... ticks, 0 safe-state calls, ...

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Coroutine
 from concurrent.futures import Future
+from typing import Any
 
 from horus.executors.base import LoopExecutor
 from horus.live import LiveNode
@@ -22,61 +24,66 @@ class TaskRunner:
         """Serve nodes on the bridge's loop."""
         self._bridge = bridge
         self._loop = bridge.loop
-        self._ticks: dict[LiveNode, RunTickAsync] = {}
-        self._running: dict[LiveNode, asyncio.Task[None]] = {}
-        self._calls: set[asyncio.Task[None]] = set()
+        self._run_ticks: dict[LiveNode, RunTickAsync] = {}
+        self._ticks: dict[LiveNode, asyncio.Task[None]] = {}
+        self._latest: dict[LiveNode, asyncio.Task[None]] = {}
 
     def adopt(self, live: LiveNode) -> None:
         """Build the node's tick path."""
-        self._ticks[live] = build_async_tick(live)
+        self._run_ticks[live] = build_async_tick(live)
 
     def forget(self, live: LiveNode) -> None:
         """Forget the node's tick path."""
-        self._ticks.pop(live, None)
+        self._run_ticks.pop(live, None)
 
     def busy(self, live: LiveNode) -> bool:
-        """Return whether a tick is in progress."""
-        return live in self._running
+        """Return whether a callback is in progress."""
+        return live in self._latest
 
     def start(self, live: LiveNode, release_ns: int) -> asyncio.Task[None]:
-        """Start a tick; the caller has made sure that none is in progress."""
-        task = self._loop.create_task(
-            self._ticks[live](release_ns),
-            name=f"horus:{live.name}",
-            context=live.context,
-        )
-        self._running[live] = task
-        task.add_done_callback(lambda _: self._running.pop(live, None))
+        """Start a tick; the caller has made sure that the node is not busy."""
+        task = self._ticks[live] = self._spawn(live, self._run_ticks[live](release_ns))
+        task.add_done_callback(lambda _: self._ticks.pop(live, None))
         return task
 
     def cancel(self, live: LiveNode) -> None:
         """Cancel the tick in progress, unless it is the one that calls."""
-        task = self._running.get(live)
+        task = self._ticks.get(live)
         if task is not None and task is not _current_task():
             task.cancel()
 
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
-        """Run a callback once the tick in progress has ended.
+        """Run a callback once those before it have ended.
 
         Thread: any.
         """
         future: Future[bool] = Future()
-
-        def start() -> None:
-            task = self._loop.create_task(
-                self._call(live, phase, future), name=f"horus:{live.name}", context=live.context
-            )
-            self._calls.add(task)
-            task.add_done_callback(self._calls.discard)
-
-        self._bridge.run(start)
+        self._bridge.run(
+            lambda: self._spawn(live, self._call(live, phase, future, self._latest.get(live)))
+        )
         return future
 
-    async def _call(self, live: LiveNode, phase: str | None, future: Future[bool]) -> None:
+    def _spawn(self, live: LiveNode, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = self._loop.create_task(work, name=f"horus:{live.name}", context=live.context)
+        self._latest[live] = task
+
+        def forget(_: object) -> None:
+            if self._latest.get(live) is task:
+                del self._latest[live]
+
+        task.add_done_callback(forget)
+        return task
+
+    async def _call(
+        self,
+        live: LiveNode,
+        phase: str | None,
+        future: Future[bool],
+        previous: asyncio.Task[None] | None,
+    ) -> None:
         try:
-            task = self._running.get(live)
-            if task is not None:
-                await asyncio.wait([task])
+            if previous is not None:
+                await asyncio.wait([previous])
             success = True if phase is None else await live.run_phase_async(phase)
         except BaseException:
             future.cancel()

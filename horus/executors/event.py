@@ -24,7 +24,7 @@ class EventExecutor(LoopExecutor):
 
     def adopt(self, live: LiveNode) -> None:
         """Build the node's tick path."""
-        if live.node.is_async:
+        if live.is_async:
             self._tasks.adopt(live)
             self._runners[live] = _EventRunner(live, self._bridge, None, self._tasks)
         else:
@@ -43,7 +43,7 @@ class EventExecutor(LoopExecutor):
 
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
         """Run a callback on the loop's thread."""
-        if live.node.is_async:
+        if live.is_async:
             return self._tasks.call(live, phase)
         return self.call_plain(live, phase)
 

@@ -19,6 +19,7 @@ class RtThread(NodeThread):
         super().__init__(live)
         self.engaged = False
         self._run_tick = build_tick(live)
+        self._timeline = live.timeline
         self._now_ns = live.timeline.now_ns
         self._grid = live.grid()
         self._index = 0
@@ -30,6 +31,9 @@ class RtThread(NodeThread):
             self.park()
             return
         now_ns = self._now_ns()
+        if self._release_ns >= self._timeline.end_ns:
+            self.park()
+            return
         early_ns = self._release_ns - now_ns
         if early_ns > 0:
             # Woken early or for a job, we come back here and look again.

@@ -33,6 +33,7 @@ class Cycle:
 
     def __init__(self, loop: asyncio.AbstractEventLoop, timeline: Timeline) -> None:
         """Begin with no nodes."""
+        self._timeline = timeline
         self._now_ns = timeline.now_ns
         self._releases = ReleaseQueue()
         self._dispatch: dict[LiveNode, Dispatch] = {}
@@ -40,7 +41,7 @@ class Cycle:
 
     def run_due(self) -> None:
         """Dispatch every release that is due; see the class for the steps."""
-        now_ns = self._now_ns()
+        now_ns = min(self._now_ns(), self._timeline.end_ns - 1)
         while (due := self._releases.pop_due(now_ns)) is not None:
             live, release_ns = due
             self._dispatch[live](live, release_ns)
@@ -69,5 +70,5 @@ class Cycle:
 
     def _arm(self) -> None:
         next_ns = self._releases.next_ns
-        if next_ns is not None:
+        if next_ns is not None and next_ns < self._timeline.end_ns:
             self._ticker.arm(next_ns)

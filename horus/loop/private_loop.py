@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import contextvars
+import logging
 import selectors
+import threading
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -13,6 +16,8 @@ from horus.clock import SimClock
 from horus.units import to_ns, to_s
 
 T = TypeVar("T")
+
+_log = logging.getLogger("horus.scheduler")
 
 _LAST_STEPS_S = 1.0
 """How long cancelled tasks may take to end when a loop is closed [s]."""
@@ -28,18 +33,30 @@ class StepLoop:
     (`sched.tick_once()` in an async test), the steps are taken on a helper
     thread while the caller waits.
 
+    Unlike `asyncio.Runner`, it does not wait for ever for tasks that ignore
+    their cancellation or for threads that hang.
+
     Thread: one at a time.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         """Take over `loop`, which must not be running."""
         self.loop = loop
+        self._workers = ThreadPoolExecutor(thread_name_prefix="horus-to-thread")
+        loop.set_default_executor(self._workers)
         self._helper: ThreadPoolExecutor | None = None
 
-    def run(self, work: Coroutine[Any, Any, T], context: contextvars.Context) -> T:
+    def run(self, work: Coroutine[Any, Any, T], context: contextvars.Context | None = None) -> T:
         """Run a coroutine to its end and return its result."""
         task = self.loop.create_task(work, context=context)
-        self.step(lambda: self.loop.run_until_complete(task))
+        try:
+            self.step(lambda: self.loop.run_until_complete(task))
+        except KeyboardInterrupt:
+            # The loop was left in the middle of a step: let the work end in order.
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                self.step(lambda: self.loop.run_until_complete(task))
+            raise
         return task.result()
 
     def step(self, run: Callable[[], object]) -> None:
@@ -52,24 +69,30 @@ class StepLoop:
         self._helper.submit(run).result()
 
     def finish(self, tasks: set[asyncio.Task[Any]]) -> None:
-        """Let cancelled tasks end; one that refuses is left alone after a while."""
+        """Let cancelled tasks end; those that refuse are left alone after a while."""
         self.loop.run_until_complete(asyncio.wait(tasks, timeout=_LAST_STEPS_S))
 
     def close(self) -> None:
         """Cancel what is left and close the loop."""
-
-        def end() -> None:
-            tasks = asyncio.all_tasks(self.loop)
-            for task in tasks:
-                task.cancel()
-            if tasks:
-                self.finish(tasks)
-            self.loop.run_until_complete(self.loop.shutdown_asyncgens())
-            self.loop.close()
-
-        self.step(end)
+        self.step(self._end)
         if self._helper is not None:
             self._helper.shutdown()
+
+    def _end(self) -> None:
+        tasks = asyncio.all_tasks(self.loop)
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            self.finish(tasks)
+        for task in asyncio.all_tasks(self.loop):
+            _log.error("task %s ignores its cancellation and is left behind", task.get_name())
+        self.loop.run_until_complete(self.loop.shutdown_asyncgens())
+        # On a thread that may be left behind: a function handed to a thread can
+        # hang, and nothing can end it.
+        last = threading.Thread(target=self._workers.shutdown, daemon=True)
+        last.start()
+        last.join(_LAST_STEPS_S)
+        self.loop.close()
 
 
 class VirtualLoop(StepLoop):
@@ -107,7 +130,7 @@ class VirtualLoop(StepLoop):
         """Let cancelled tasks end, as far as they do without time passing."""
         self.loop.run_forever()
 
-    def run(self, work: Coroutine[Any, Any, T], context: contextvars.Context) -> T:
+    def run(self, work: Coroutine[Any, Any, T], context: contextvars.Context | None = None) -> T:
         """Run a coroutine to its end, moving the clock from timer to timer."""
         task = self.loop.create_task(work, context=context)
         self.settle()

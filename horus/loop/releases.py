@@ -6,6 +6,7 @@ import heapq
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from horus import clock
 from horus.live import LiveNode
 from horus.timing import ReleaseGrid
 
@@ -21,6 +22,8 @@ class _Release:
     index: int = field(compare=False)
     grid: ReleaseGrid = field(compare=False)
     live: LiveNode = field(compare=False)
+    last_ns: int = field(compare=False, default=clock.NEVER)
+    """The release that was handed out last [ns]."""
     cancelled: bool = field(compare=False, default=False)
 
 
@@ -42,11 +45,12 @@ class ReleaseQueue:
             heapq.heappop(self._heap)
         return self._heap[0].at_ns if self._heap else None
 
-    def add(self, live: LiveNode, rank: Rank, now_ns: int) -> None:
-        """Queue the first release of `live` at or after `now_ns`."""
+    def add(self, live: LiveNode, rank: Rank, now_ns: int, last_ns: int = clock.NEVER) -> None:
+        """Queue the first release of `live` at or after `now_ns`, and after `last_ns`."""
+        self.remove(live)
         grid = live.grid()
-        index = grid.first_from(now_ns)
-        release = _Release(grid.at(index), rank, index, grid, live)
+        index = grid.first_from(max(now_ns, last_ns + 1))
+        release = _Release(grid.at(index), rank, index, grid, live, last_ns)
         self._of_node[live] = release
         heapq.heappush(self._heap, release)
 
@@ -61,7 +65,7 @@ class ReleaseQueue:
         release = self._of_node.get(live)
         if release is not None:
             self.remove(live)
-            self.add(live, release.rank, now_ns)
+            self.add(live, release.rank, now_ns, release.last_ns)
 
     def rerank(self, ranks: Mapping[LiveNode, Rank]) -> None:
         """Give every node a new place in execution order."""
@@ -82,6 +86,7 @@ class ReleaseQueue:
         latest = release.grid.index_at(now_ns)
         release.live.counters.skipped += latest - release.index
         release_ns = release.grid.at(latest)
+        release.last_ns = release_ns
         release.index = latest + 1
         release.at_ns = release.grid.at(latest + 1)
         heapq.heapreplace(self._heap, release)

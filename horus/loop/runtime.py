@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
+from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Mapping
 from concurrent.futures import Future
 from typing import Any
@@ -13,7 +14,6 @@ import anyio
 
 from horus import clock
 from horus.clock import Timeline
-from horus.errors import StateError
 from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
@@ -27,12 +27,14 @@ _HEAD_START_NS = 2 * NS_PER_MS
 """From the last `init()` to release 0 [ns]: time for every thread to be ready for it."""
 
 MakeExecutors = Callable[[Bridge, Cycle], Mapping[ExecutionClass, Executor]]
+Members = Callable[[], Iterable[LiveNode]]
 
 
 class Runtime:
     """Owns what exists only while a scheduler runs: loop hooks, homes, supervisor.
 
-    Thread: loop, except the methods that say otherwise.
+    Thread: loop, except the methods that say otherwise. Those only leave a note
+    (`_post`) for the loop, which alone decides who takes part.
     """
 
     def __init__(
@@ -48,30 +50,36 @@ class Runtime:
         self._make_executors = make_executors
         self._shutdown_timeout_ns = shutdown_timeout_ns
         self._homes: dict[LiveNode, Executor] = {}
+        self._joining: deque[LiveNode] = deque()
+        self._grid_started = False
         self._stop_requested = threading.Event()
         self._stopping = threading.Event()
         self._stop_event = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._lock = threading.Lock()
         self._bridge: Bridge | None = None
+        self._over = False
+        self._notes: deque[Callable[[], None]] = deque()
 
     async def run(
-        self, lives: Iterable[LiveNode], duration_s: float | None, *, shut_down_after: bool = True
+        self, members: Members, duration_ns: int | None, *, shut_down_after: bool = True
     ) -> None:
         """Initialise the nodes, tick them until stopped, and bring them to rest.
 
         Args:
-            lives: The nodes to begin with.
-            duration_s: How long to tick [s]; None until stopped.
+            members: Tells the nodes to begin with.
+            duration_ns: How long to tick [ns]; None until stopped.
             shut_down_after: Whether `shutdown()` is called at the end. A timed step
                 of a simulation leaves its nodes initialised for the next one.
         """
         with contextlib.ExitStack() as resources:
             self._open(resources)
             try:
-                await self._initialize(sorted(lives, key=lambda live: live.rank))
-                self._engage()
-                await self._until_stopped(duration_s)
+                await self._initialize(members())
+                self._engage(duration_ns)
+                await self._until_stopped()
             finally:
+                self._stop_requested.set()
                 self._stopping.set()
                 self._timeline.pause()
                 await uninterrupted(self._finish(shut_down_after))
@@ -90,11 +98,12 @@ class Runtime:
             # At once, not when the loop gets to it: a tick that asks for a stop is
             # the last of its node.
             live.leave_service()
-        if self._bridge is not None:
-            self._bridge.post(self._stop_event.set)
+        self._post(self._stop_event.set)
+        bridge = self._bridge
+        if bridge is not None and not bridge.on_loop_thread():
             self._supervisor.spawn(
                 report_blocked_loop(
-                    self._bridge.thread_id, self._stopping, to_s(self._shutdown_timeout_ns)
+                    bridge.thread_id, self._stopping, to_s(self._shutdown_timeout_ns)
                 )
             )
 
@@ -103,7 +112,7 @@ class Runtime:
 
         Thread: any.
         """
-        self.bridge.post(lambda: self._spawn(self._bring_up(live)))
+        self._post(lambda: self._join(live))
 
     def retime(self, live: LiveNode) -> None:
         """Adopt a node's changed rate.
@@ -116,34 +125,19 @@ class Runtime:
             if home is not None:
                 home.retime(live)
 
-        self.bridge.run(retime)
+        self._post(retime)
 
     def remove(self, live: LiveNode) -> Future[None]:
         """Shut a node down while the others go on; done when `shutdown()` has run.
 
         Thread: any. Called on the loop's thread, a plain node whose home is free
-        has been shut down when this returns.
+        has been shut down when this returns. While the whole run shuts down, the
+        node has its turn there, and the future is done at once.
         """
         removed: Future[None] = Future()
-
-        def start() -> None:
-            home = self._homes.pop(live, None)
-            if home is None:
-                removed.set_result(None)
-                return
-            home.disengage(live)
-
-            def finish(_: object) -> None:
-                live.stopped()
-                removed.set_result(None)
-                self.bridge.post(lambda: home.dismiss(live))
-
-            if live.initialized:
-                begin_shutdown(live, home).add_done_callback(finish)
-            else:
-                finish(None)
-
-        self.bridge.run(start)
+        live.removed = True
+        live.leave_service()
+        self._post(lambda: self._leave(live, removed))
         return removed
 
     def is_home(self, live: LiveNode) -> bool:
@@ -151,14 +145,26 @@ class Runtime:
 
         Thread: any.
         """
-        return self._executors[live.spec.execution_class].is_home(live)
+        home = self._executors[live.spec.execution_class]
+        return home.is_home(live)
 
-    @property
-    def bridge(self) -> Bridge:
-        """The way into the run's event loop."""
-        if self._bridge is None:
-            raise StateError("the run has not begun or is over")
-        return self._bridge
+    def _post(self, note: Callable[[], None]) -> None:
+        """Do something on the loop's thread: now if this is it, else soon.
+
+        Before the loop is open, notes wait; when the run is over, nobody takes part
+        any more and they are done here and now.
+
+        Thread: any.
+        """
+        with self._lock:
+            bridge = self._bridge
+            if bridge is None and not self._over:
+                self._notes.append(note)
+                return
+        if bridge is None:
+            note()
+        else:
+            bridge.run(note)
 
     # -- the run ------------------------------------------------------------------
 
@@ -175,18 +181,27 @@ class Runtime:
         cycle = Cycle(bridge.loop, self._timeline)
         resources.callback(cycle.close)
         self._executors = self._make_executors(bridge, cycle)
-        self._bridge = bridge
-        if self._stop_requested.is_set():
-            self._stop_event.set()
+        resources.callback(self._close)
+        with self._lock:
+            self._bridge = bridge
+        while self._notes:
+            self._notes.popleft()()
 
-    async def _initialize(self, lives: list[LiveNode]) -> None:
+    def _close(self) -> None:
+        with self._lock:
+            self._bridge = None
+            self._over = True
+
+    async def _initialize(self, lives: Iterable[LiveNode]) -> None:
         """Call `init()` of each node in order; one that fails is left out, others go on."""
-        for live in lives:
-            if self._stop_requested.is_set():
-                return
-            await self._adopt(live)
+        self._joining.extend(sorted(lives, key=lambda live: live.rank))
+        while self._joining and not self._stop_requested.is_set():
+            # Nodes that are added by an init() come after those that were there.
+            await self._adopt(self._joining.popleft())
 
     async def _adopt(self, live: LiveNode) -> None:
+        if live.removed or live in self._homes:
+            return
         home = self._executors[live.spec.execution_class]
         self._homes[live] = home
         home.adopt(live)
@@ -197,30 +212,66 @@ class Runtime:
             await asyncio.wait((initialized, stopped), return_when=asyncio.FIRST_COMPLETED)
             stopped.cancel()
 
-    def _engage(self) -> None:
+    def _engage(self, duration_ns: int | None) -> None:
         """Start the release grid, and with it the ticks."""
-        self._timeline.begin(self._timeline.now_ns() + _HEAD_START_NS)
+        self._timeline.begin(self._timeline.now_ns() + _HEAD_START_NS, duration_ns)
         clock.set_ambient(self._timeline)
+        self._grid_started = True
         for live in self._homes:
             self._engage_one(live)
 
     def _engage_one(self, live: LiveNode) -> None:
-        if live.initialized and not self._stop_requested.is_set():
+        if live.initialized and not live.removed and not self._stop_requested.is_set():
             self._homes[live].engage(live)
 
-    async def _until_stopped(self, duration_s: float | None) -> None:
-        if duration_s is None:
+    async def _until_stopped(self) -> None:
+        timeline = self._timeline
+        if timeline.end_ns == clock.FOREVER_NS:
             await self._stop_event.wait()
             return
-        with anyio.move_on_after(duration_s + to_s(_HEAD_START_NS)):
-            await self._stop_event.wait()
+        while (left_ns := timeline.end_ns - timeline.now_ns()) > 0:
+            # Loop timers may fire early: look again.
+            with anyio.move_on_after(to_s(left_ns)):
+                await self._stop_event.wait()
+                return
+
+    def _join(self, live: LiveNode) -> None:
+        """Let a node that was added during the run take part."""
+        if not self._grid_started:
+            self._joining.append(live)
+        elif not self._stop_requested.is_set():
+            task = asyncio.ensure_future(self._bring_up(live))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
 
     async def _bring_up(self, live: LiveNode) -> None:
-        """Put a node that was added during the run into service."""
-        if self._stopping.is_set():
-            return
         await self._adopt(live)
-        self._engage_one(live)
+        if live in self._homes:
+            self._engage_one(live)
+
+    def _leave(self, live: LiveNode, removed: Future[None]) -> None:
+        """Take a node out of the run: when its home is free, shut it down and dismiss it."""
+        home = self._homes.get(live)
+        if home is None or self._stopping.is_set():
+            removed.set_result(None)
+            return
+        home.disengage(live)
+
+        def dismiss() -> None:
+            live.stopped()
+            if self._homes.pop(live, None) is not None:
+                home.dismiss(live)
+            removed.set_result(None)
+
+        def shut_down() -> None:
+            if live.initialized:
+                shutdown = begin_shutdown(live, home)
+                shutdown.add_done_callback(lambda _: self._post(dismiss))
+            else:
+                dismiss()
+
+        # Whatever runs in the home comes first, also an init() that has just begun.
+        home.call(live, None).add_done_callback(lambda _: self._post(shut_down))
 
     async def _finish(self, shut_down_after: bool) -> None:
         if shut_down_after:
@@ -229,11 +280,6 @@ class Runtime:
         await quiesce(self._homes, self._shutdown_timeout_ns)
         for live, home in self._homes.items():
             home.dismiss(live)
-
-    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.ensure_future(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
 
 
 async def uninterrupted(work: Coroutine[Any, Any, None]) -> None:

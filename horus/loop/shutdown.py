@@ -30,8 +30,8 @@ async def shut_down(homes: Mapping[LiveNode, Executor], timeout_ns: int) -> None
     Each node's `shutdown()` is called exactly once, whatever the others do.
     """
     stuck = await quiesce(homes, timeout_ns)
-    for live in sorted(homes, key=lambda live: live.rank, reverse=True):
-        home = homes[live]
+    # A copy: a node that was just being removed may still take itself out.
+    for live, home in sorted(homes.items(), key=lambda item: item[0].rank, reverse=True):
         if live.initialized:
             if live in stuck:
                 _log.error(
@@ -80,7 +80,7 @@ def _stand_in(live: LiveNode) -> Future[bool]:
     future: Future[bool] = Future()
     # A copy: the stuck tick still holds the node's own context.
     context = live.context.copy()
-    if live.node.is_async:
+    if live.is_async:
         task = asyncio.get_running_loop().create_task(
             live.run_phase_async("shutdown"), name=f"horus-shutdown:{live.name}", context=context
         )

@@ -72,26 +72,9 @@ class Simulation(Stepper):
                 edge.topic,
             )
 
-    def add(self, live: LiveNode) -> None:
-        """Make a node ready to tick; during the run it joins the release grid."""
-        super().add(live)
-        if self._places:
-            self._join(live)
-
-    def remove(self, live: LiveNode) -> None:
-        """Shut a node down during the run."""
-        self._releases.remove(live)
-        self._messaged.pop(live, None)
-        if live.trigger is not None:
-            live.trigger.wake = None
-        task = self._in_flight.pop(live, None)
-        if task is not None:
-            task.cancel()
-        super().remove(live)
-
     def retime(self, live: LiveNode) -> None:
         """Move a node to the grid of its changed rate."""
-        self._releases.retime(live, self._clock.now_ns() + 1)
+        self._releases.retime(live, self._clock.now_ns())
 
     def shut_down(self, lives: Iterable[LiveNode]) -> None:
         """Cancel async ticks, then call each node's `shutdown()` in reverse order."""
@@ -101,6 +84,22 @@ class Simulation(Stepper):
         super().shut_down(lives)
         self._releases.clear()
         self._messaged.clear()
+
+    def _add(self, live: LiveNode) -> None:
+        super()._add(live)
+        if self._places and live in self._in_order:
+            self._join(live)
+
+    def _remove(self, live: LiveNode) -> None:
+        self._releases.remove(live)
+        self._messaged.pop(live, None)
+        if live.trigger is not None:
+            live.trigger.wake = None
+        task = self._in_flight.pop(live, None)
+        if task is not None:
+            task.cancel()
+            self._settle()
+        super()._remove(live)
 
     def _join(self, live: LiveNode) -> None:
         self._find_order()
@@ -158,7 +157,7 @@ class Simulation(Stepper):
             self.advance(end_ns, stopped)
             return
         for live in sorted(named, key=self._places.__getitem__):
-            if live.trigger is None:
+            if live.trigger is None and not live.retired:
                 self._release(live, now_ns)
             self._deliver(stopped, named)
         self.advance(end_ns, stopped, only=())
@@ -170,8 +169,8 @@ class Simulation(Stepper):
     # -- ticks ----------------------------------------------------------------------
 
     def _release(self, live: LiveNode, release_ns: int) -> None:
-        if not live.node.is_async:
-            self._plain[live](release_ns)
+        if not live.is_async:
+            self.tick(live, release_ns)
             return
         if live in self._in_flight:
             live.counters.skipped += 1
@@ -185,8 +184,12 @@ class Simulation(Stepper):
         self._settle()
 
     def _settle(self) -> None:
-        if self._virtual is not None:
-            self._virtual.settle()
+        if self._virtual is not None and not self._depth:
+            self._depth += 1
+            try:
+                self._virtual.settle()
+            finally:
+                self._callback_ended()
 
     def _deliver(self, stopped: Callable[[], bool], only: Collection[LiveNode] | None) -> None:
         """Tick event nodes, one per message, until no message waits."""

@@ -7,6 +7,7 @@ each node's tick path, and a private event loop for the async ones.
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable, Collection, Iterable
 
 from horus import clock
@@ -30,6 +31,8 @@ class Stepper:
         self._async: dict[LiveNode, RunTickAsync] = {}
         self._in_order: list[LiveNode] = []
         self._step_loop: StepLoop | None = None
+        self._depth = 0
+        self._changes: deque[Callable[[], None]] = deque()
 
     @property
     def step_loop(self) -> StepLoop:
@@ -49,39 +52,45 @@ class Stepper:
             self.add(live)
 
     def add(self, live: LiveNode) -> None:
-        """Make a node ready to tick, calling `init()` if it has not been."""
-        if live.node.is_async:
-            self._async[live] = build_async_tick(live)
-        else:
-            self._plain[live] = build_tick(live)
-        if live.state is NodeState.UNINITIALIZED:
-            self.run_phase(live, "init")
-        live.enter_service()
-        self._in_order = sorted([*self._in_order, live], key=lambda live: live.rank)
+        """Make a node ready to tick, calling `init()` if it has not been.
+
+        Called from a callback, a plain node is ready at once, an async one when
+        that callback has ended: its `init()` needs the loop.
+        """
+        self._change(live, lambda: self._add(live))
 
     def remove(self, live: LiveNode) -> None:
-        """Shut a node down and forget it."""
-        self._in_order = [other for other in self._in_order if other is not live]
-        self.shut_down_one(live)
-        self._plain.pop(live, None)
-        self._async.pop(live, None)
+        """Shut a node down and forget it: at once, or when the callback that asks has ended.
+
+        The latter for a node that removes itself, and for async nodes.
+        """
+        live.leave_service()
+        self._change(live, lambda: self._remove(live))
 
     def retime(self, live: LiveNode) -> None:
         """Do nothing: steps have no rates."""
 
     def run_phase(self, live: LiveNode, phase: str) -> None:
         """Run a callback other than `tick`."""
-        if live.node.is_async:
-            self.step_loop.run(live.run_phase_async(phase), live.context)
-        else:
-            live.run_phase(phase)
+        self._depth += 1
+        try:
+            if live.is_async:
+                self.step_loop.run(live.run_phase_async(phase), live.context)
+            else:
+                live.run_phase(phase)
+        finally:
+            self._callback_ended()
 
     def tick(self, live: LiveNode, release_ns: int) -> None:
         """Run a tick to its end."""
-        if live.node.is_async:
-            self.step_loop.run(self._async[live](release_ns), live.context)
-        else:
-            self._plain[live](release_ns)
+        self._depth += 1
+        try:
+            if live.is_async:
+                self.step_loop.run(self._async[live](release_ns), live.context)
+            else:
+                self._plain[live](release_ns)
+        finally:
+            self._callback_ended()
 
     def cycle(self, stopped: Callable[[], bool], named: Collection[LiveNode] | None) -> None:
         """Tick the nodes once, in order, without rate control; only those named, if any are.
@@ -91,7 +100,7 @@ class Stepper:
         timeline = self.timeline
         timeline.begin_step()
         for live in self._in_order:
-            if named is not None and live not in named:
+            if live.retired or (named is not None and live not in named):
                 continue
             if live.trigger is not None:
                 self._tick_per_message(live)
@@ -119,6 +128,37 @@ class Stepper:
         if self._step_loop is not None:
             self._step_loop.close()
             self._step_loop = None
+
+    def _add(self, live: LiveNode) -> None:
+        if live.removed:
+            return
+        if live.is_async:
+            self._async[live] = build_async_tick(live)
+        else:
+            self._plain[live] = build_tick(live)
+        if live.state is NodeState.UNINITIALIZED:
+            self.run_phase(live, "init")
+        live.enter_service()
+        self._in_order = sorted([*self._in_order, live], key=lambda live: live.rank)
+
+    def _remove(self, live: LiveNode) -> None:
+        self._in_order = [other for other in self._in_order if other is not live]
+        self.shut_down_one(live)
+        self._plain.pop(live, None)
+        self._async.pop(live, None)
+
+    def _change(self, live: LiveNode, change: Callable[[], None]) -> None:
+        """Change who takes part: now, or when the callback on the stack below has ended."""
+        if self._depth and (live.is_async or live.ticking):
+            self._changes.append(change)
+        else:
+            change()
+
+    def _callback_ended(self) -> None:
+        """Make the changes that had to wait for the end of the outermost callback."""
+        self._depth -= 1
+        while self._changes and not self._depth:
+            self._changes.popleft()()
 
     def _tick_per_message(self, live: LiveNode) -> None:
         trigger = live.trigger

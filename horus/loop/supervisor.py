@@ -34,8 +34,11 @@ class Supervisor:
         self._thread.start()
 
     def spawn(self, task: Coroutine[Any, Any, None]) -> None:
-        """Run a supervision task."""
-        asyncio.run_coroutine_threadsafe(task, self._loop)
+        """Run a supervision task; after `close` there is nothing left to supervise."""
+        try:
+            asyncio.run_coroutine_threadsafe(task, self._loop)
+        except RuntimeError:
+            task.close()
 
     def close(self) -> None:
         """Cancel what runs and end the thread."""

@@ -107,6 +107,34 @@ def running(sched: Scheduler) -> Iterator[threading.Thread]:
         raise errors[0]
 
 
+def run_until(sched: Scheduler, condition: Callable[[], object]) -> None:
+    """Run a scheduler on the calling thread until `condition()` holds, then stop it.
+
+    A noisy machine may sleep through any fixed time; what must happen is waited for.
+    """
+    over, met = threading.Event(), threading.Event()
+    give_up_at = time.monotonic() + PATIENCE_S
+
+    def watch() -> None:
+        while not over.wait(0.001) and time.monotonic() < give_up_at:
+            if condition():
+                met.set()
+                break
+        while not over.wait(0.001):
+            # A scheduler that is about to run has nothing to stop yet.
+            if sched.is_running():
+                sched.stop()
+
+    watcher = threading.Thread(target=watch, name="test-watch")
+    watcher.start()
+    try:
+        sched.run()
+    finally:
+        over.set()
+        watcher.join()
+    assert met.is_set() or condition(), f"not so within {PATIENCE_S} s"
+
+
 def all_have_ticked(sched: Scheduler) -> bool:
     """Return whether every node has completed a tick."""
     return all(info["total_ticks"] > 0 for info in sched.get_all_nodes())

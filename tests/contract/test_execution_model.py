@@ -11,7 +11,16 @@ import pytest
 import horus
 from horus import ExecutionClass, Node, ms
 
-from .helpers import KINDS, TRIGGER, node_of, nothing, record_ticks, run_async
+from .helpers import (
+    KINDS,
+    TRIGGER,
+    all_have_ticked,
+    node_of,
+    nothing,
+    record_ticks,
+    run_async,
+    run_until,
+)
 
 
 def test_nodes_tick_in_order_sequence(make, deterministic):
@@ -59,17 +68,16 @@ def test_best_effort_nodes_execute_sequentially_in_order_on_the_calling_thread(m
     sched = make(loop=loop)
 
     def tick(node):
-        journal.append((node.name, threading.get_ident()))
+        journal.append((horus.tick(), node.order, threading.get_ident()))
 
-    for name, order in (("second", 2), ("third", 3), ("first", 1)):
-        sched.add(Node(name, tick, order=order))
+    for order in (2, 3, 1):
+        sched.add(Node(f"node{order}", tick, order=order))
 
-    sched.run(duration=0.2)
+    run_until(sched, lambda: len(journal) >= 12)
 
-    names = [name for name, _ in journal]
-    assert len(names) >= 6
-    assert names == ["first", "second", "third"] * (len(names) // 3)
-    assert {thread for _, thread in journal} == {threading.get_ident()}
+    assert journal == sorted(journal)
+    assert {order for _, order, _ in journal} == {1, 2, 3}
+    assert {thread for _, _, thread in journal} == {threading.get_ident()}
 
 
 @pytest.mark.realtime
@@ -84,7 +92,7 @@ def test_rt_and_compute_nodes_run_on_their_own_threads(make, loop):
     for index, kind in enumerate(("Rt", "Compute", "Rt", "Compute")):
         sched.add(node_of(kind, f"{kind}{index}", note, init=note, shutdown=note))
 
-    sched.run(duration=0.1)
+    run_until(sched, lambda: all_have_ticked(sched))
 
     threads = {name: {t for n, t in journal if n == name} for name, _ in journal}
     assert len(threads) == 4
@@ -105,9 +113,8 @@ def test_event_and_async_nodes_share_the_event_loop_of_the_run(make, loop):
     sched.add(Node("best_effort", note))
     sched.publish(TRIGGER, 1)
 
-    sched.run(duration=0.1)
+    run_until(sched, lambda: len(places) == 3)
 
-    assert len(places) == 3
     assert len(set(places.values())) == 1
     assert places["event"][0] == threading.get_ident()
 
@@ -137,11 +144,14 @@ def test_each_node_keeps_its_own_rate_in_real_time(make, loop):
 
     sched.add(Node("slow", count, rate=20)).add(Node("fast", count, rate=200))
 
-    sched.run(duration=0.42)
+    begun = time.monotonic()
+    run_until(sched, lambda: counts["slow"] >= 8)
+    took = time.monotonic() - begun
 
-    assert 7 <= counts["slow"] <= 9
-    assert counts["fast"] <= 85
-    assert counts["fast"] > 4 * counts["slow"]
+    # Late releases are skipped and never made up for: a rate is an upper bound.
+    assert counts["fast"] <= 200 * took + 1
+    assert counts["slow"] <= 20 * took + 1
+    assert counts["fast"] > 3 * counts["slow"]
 
 
 @pytest.mark.parametrize("kind", ["Rt", "Compute", "AsyncIo"])
@@ -173,9 +183,9 @@ def test_a_real_time_release_grid_does_not_drift(make, loop):
     sched.run(duration=0.5)
 
     for name in ("rt", "compute"):
-        # Sleeping a period after each tick would give 41 ticks, not 50.
+        # Sleeping a period after each tick would give at most 41, not 50.
         done = counts[name] + sched.get_node_stats(name)["skipped"]
-        assert 49 <= done <= 52
+        assert done >= 45
 
 
 def test_the_timer_measures_how_long_tick_took(make):
@@ -255,7 +265,8 @@ def test_the_global_tick_rate_is_maintained(make, loop):
     steps = {later - earlier for earlier, later in zip(cycles, cycles[1:], strict=False)}
     assert cycles[0] % 4 == 0
     assert all(step % 4 == 0 for step in steps)
-    assert 76 <= cycles[-1] <= 84
+    assert sched.current_tick() >= 80
+    assert cycles[-1] <= 84
 
 
 def test_the_execution_class_of_every_kind_is_the_one_under_test(kind):
@@ -272,7 +283,9 @@ def test_the_scheduler_runs_beside_an_application_on_its_loop(make, loop):
 
     async def main():
         loops["application"] = asyncio.get_running_loop()
-        await sched.arun(duration=0.05)
+        async with sched:
+            while "node" not in loops:
+                await asyncio.sleep(1 * ms)
 
     run_async(main(), loop)
 

@@ -10,7 +10,7 @@ import pytest
 import horus
 from horus import ExecutionClass, Node, Scheduler, ms, us
 
-from .helpers import KINDS, TRIGGER, node_of, nothing
+from .helpers import KINDS, TRIGGER, all_have_ticked, node_of, nothing, run_until
 
 
 def advance(sched: Scheduler, way: str) -> None:
@@ -59,7 +59,7 @@ def test_init_is_called_on_every_node_in_order_before_the_first_tick(make, loop)
         )
     sched.publish(TRIGGER, 1)
 
-    sched.run(duration=0.1)
+    run_until(sched, lambda: all_have_ticked(sched))
 
     assert journal[: len(KINDS)] == [("init", kind) for kind in KINDS]
     assert {name for phase, name in journal[len(KINDS) :] if phase == "tick"} == set(KINDS)
@@ -123,10 +123,9 @@ def test_a_node_whose_init_raises_enters_error_state_and_others_continue(make, l
         Node("watch", lambda: states.append(sched.get_node_stats("broken")["state"]), order=2)
     )
 
-    sched.run(duration=0.1)
+    run_until(sched, lambda: ticked.count("working") >= 5 and states)
 
     assert "broken" not in ticked
-    assert ticked.count("working") >= 5
     assert set(states) == {"error"}
 
 
@@ -231,7 +230,7 @@ def test_init_runs_where_the_node_ticks(make, loop, kind):
     sched.add(node_of(kind, "node", note, init=note, shutdown=note))
     sched.publish(TRIGGER, 1)
 
-    sched.run(duration=0.08)
+    run_until(sched, lambda: all_have_ticked(sched))
 
     assert len(threads) >= 3
     assert len(set(threads)) == 1
@@ -274,7 +273,7 @@ def test_a_scheduler_can_run_again_with_a_new_init(make, loop, kind):
 
     for _ in range(2):
         sched.publish(TRIGGER, 1)
-        sched.run(duration=0.06)
+        run_until(sched, lambda: journal[-1:] == ["tick"])
 
     second = journal.index("shutdown") + 1
     for life in (journal[:second], journal[second:]):

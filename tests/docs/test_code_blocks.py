@@ -90,8 +90,8 @@ def test_shown_output_stands_for_actual_output(shown: list[str], actual: list[st
 @pytest.mark.parametrize(
     ("shown", "actual", "figures_vary", "fits"),
     [
-        ("12:00:00.000 INFO    a @1: on", "23:59:59.999 INFO    a @7: on", False, True),
-        ("12:00:00.000 INFO    a @1: on", "23:59:59.999 INFO    b @1: on", False, False),
+        ("12:00:00.000 INFO    @1 a: on", "23:59:59.999 INFO    @7 a: on", False, True),
+        ("12:00:00.000 INFO    @1 a: on", "23:59:59.999 INFO    @1 b: on", False, False),
         ("ticks  12.5", "ticks    7", False, False),
         ("ticks  12.5", "ticks    7", True, True),
         ("ticks  12.5", "tacks 12.5", True, False),
@@ -109,7 +109,7 @@ def test_what_varies_by_nature_is_not_compared(
 
 def test_shown_output_belongs_to_the_block_before_it():
     """Output and log are told apart by the title, whatever prose is between."""
-    page = "```python\nrun()\n```\nprints\n```text\na\nb\n```\n```text title=\"log\"\nc\n```\n"
+    page = '```python\nrun()\n```\nprints\n```text\na\nb\n```\n```text title="log"\nc\n```\n'
     (block,) = doc_pages.blocks(page)
     assert (block.line, block.code) == (2, "run()")
     assert (block.printed, block.logged) == (["a", "b"], ["c"])

@@ -154,6 +154,41 @@ def test_contenders_alternate_within_each_workload(monkeypatch: pytest.MonkeyPat
     assert len(said) == len(runs)
 
 
+def test_a_disturbed_run_is_repeated_and_its_calmest_attempt_counts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Repeats end with the first calm attempt; without one, the calmest is kept."""
+    loads = [80.0, 60.0, 5.0, 70.0]
+
+    def disturbed(
+        contender: Contender, workload: str, *, round_number: int, quick: bool
+    ) -> ChildRun:
+        return ChildRun(
+            round=round_number,
+            workload=workload,
+            contender=contender.label,
+            other_load_percent=loads.pop(0) if len(loads) > 1 else loads[0],
+        )
+
+    monkeypatch.setattr(harness, "run_child", disturbed)
+    contenders = [Contender(label="a", python=Path(sys.executable))]
+
+    def run(limit: float) -> float | None:
+        (only,) = harness.run_rounds(
+            contenders,
+            ["x"],
+            rounds=1,
+            quick=True,
+            progress=lambda _: None,
+            max_other_load_percent=limit,
+        )
+        return only.other_load_percent
+
+    assert run(100.0) == 80.0
+    assert run(10.0) == 5.0
+    assert run(10.0) == 70.0
+
+
 def test_options_default_to_five_rounds_and_quick_to_one() -> None:
     """An explicit number of rounds wins over both defaults."""
     assert micro.parse([]).rounds == 5
