@@ -247,6 +247,8 @@ def report(
     if len(contenders) > 1:
         notes += " ratio = this package / peer."
     notes += ' Lower is better, except for "ticks run".'
+    for run in (run for run in runs if run.error is not None):
+        notes += f"\nround {run.round}, {run.workload} of {run.contender} failed: {run.error}"
     head = "  \n".join(lines) if markdown else "\n".join(lines)
     return f"{head}\n\n{table}\n\n{notes}"
 

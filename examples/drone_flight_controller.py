@@ -1,7 +1,34 @@
 """A drone flight controller: a quadrotor flies a square, in real time or in virtual time.
 
-    python examples/drone_flight_controller.py                   # real time, about 25 s
+    python examples/drone_flight_controller.py                   # real time, about 21 s
     python examples/drone_flight_controller.py --deterministic   # the same flight every time
+    python examples/drone_flight_controller.py --strict          # ends at the first late ESC tick
+    python examples/drone_flight_controller.py --deterministic --duration 8    # ends in the air
+
+The drone calibrates its gyroscope, takes off, flies round a square of 4 m in a breeze with a gust,
+lands and stops its motors. It knows its attitude and position only from noisy sensors. However a
+run ends, the ESC brings the drone down and stops the motors before the sensors disconnect. The
+exit code is 0 when the whole square was flown well, and `drone.png` shows it.
+
+    order  node      rate     what it does
+        0  imu       400 Hz   gyroscope, accelerometer, magnetometer; complementary filter
+        5  gps        10 Hz   position and velocity
+       10  attitude  400 Hz   inner loop: attitude and rates to motor commands
+       15  pilot      10 Hz   hands out the waypoints, ends the run after the landing
+       20  position   50 Hz   outer loop: dead reckoning, GPS, PID on a smooth reference
+       30  esc       400 Hz   drives the motors, hard deadline; steps the physics
+      100  logger     10 Hz   logs, prints a line a second
+
+The end of what it prints with `--deterministic` (in real time the numbers vary a little):
+
+    square flown          True (corners missed by 0.018, 0.019, 0.019, 0.037 m)
+    tracking error        RMS 0.030 m, max 0.054 m
+    on the square         RMS 0.030 m, max 0.049 m
+    greatest tilt         18.4 degrees
+    landed                True (off by 0.023 m)
+    touchdown             0.485 m/s
+    thrust at the end     0.000 N
+    shutdown order        esc -> gps -> imu
 """
 
 from __future__ import annotations
@@ -32,17 +59,18 @@ if TYPE_CHECKING:
     from drone.course import Waypoint
     from drone.sensors import GpsFix
 
-STALE_S = 0.1
+STALE_S = 100 * ms
+"""Motor commands older than this are not flown on, whatever the scheduler's policies."""
 STALL_S = 20 * ms
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Policies:
-    """How hard the flight controller is on itself."""
+    """How hard the flight controller is on itself: arguments of three nodes and the scheduler."""
 
+    imu: dict[str, Any]
     attitude: dict[str, Any]
     esc: dict[str, Any]
-    imu: dict[str, Any]
     scheduler: dict[str, Any]
 
 
@@ -101,27 +129,28 @@ class PositionControl(Node):
 
     def tick(self) -> None:
         """Navigate, follow the course, ask for an attitude and report."""
-        dt_s = min(horus.dt(), MAX_ADVANCE_S)
+        dt_s = self._navigate()
+        if self._imu is None or dt_s <= 0.0:
+            return
         navigator, follower = self._navigator, self._follower
-        calibrated = self._navigate()
         waypoint: Waypoint | None = self.recv("waypoint")
         if waypoint is not None:
             follower.take(waypoint)
         reference = follower.advance(dt_s)
         position_m, velocity_mps = navigator.position_m, navigator.velocity_mps
-        error_m = math.dist(position_m, reference.position_m)
+        error_m = follower.error_m(reference, position_m)
         arrived = follower.arrived(error_m, velocity_mps[2], dt_s)
         setpoint = control.DISARMED
         if follower.flying:
             wanted = self._controller.acceleration(reference, position_m, velocity_mps, dt_s)
             setpoint = control.attitude_for(wanted, yaw_rad=0.0)
-            self._log.add_reference(follower.name, reference.position_m)
+            self._log.add_reference(self._imu.time_s, follower.name, reference.position_m)
         self.send("setpoint", setpoint)
         self.send(
             "nav",
             Navigation(
                 leg=follower.name,
-                arrived=arrived or (calibrated and follower.waypoint is None),
+                arrived=arrived,
                 position_m=position_m,
                 velocity_mps=velocity_mps,
                 drift_mps2=navigator.drift_mps2,
@@ -129,18 +158,23 @@ class PositionControl(Node):
             ),
         )
 
-    def _navigate(self) -> bool:
-        """Go on by what the IMU felt since the last tick; return whether it is calibrated."""
+    def _navigate(self) -> float:
+        """Go on by what the IMU felt since the last tick; return how long that was [s].
+
+        By the IMU's clock: when it has nothing new, there is nothing to decide either.
+        """
         imu: Imu | None = self.recv("imu")
-        if imu is not None:
+        dt_s = 0.0
+        if imu is not None and imu.calibrated:
             if self._imu is not None:
+                dt_s = imu.time_s - self._imu.time_s
                 gained = difference(imu.gained_mps, self._imu.gained_mps)
-                self._navigator.predict(gained, imu.time_s - self._imu.time_s)
+                self._navigator.predict(gained, dt_s)
             self._imu = imu
         fix: GpsFix | None = self.recv("gps")
         if fix is not None:
             self._navigator.correct(fix)
-        return self._imu is not None and self._imu.calibrated
+        return dt_s
 
 
 class Esc(Node):
@@ -169,7 +203,7 @@ class Esc(Node):
     def tick(self) -> None:
         """Pass the newest motor commands on, unless they are stale."""
         # A skipped release makes dt longer, and the drone flies further: it keeps its true
-        # speed. In deterministic mode dt is two timesteps, so one tick is two steps.
+        # speed. In deterministic mode dt is two timesteps, so one tick is two physics steps.
         dt_s = min(horus.dt(), MAX_ADVANCE_S)
         thrusts: Thrusts | None = self.recv("motor_cmd")
         self._age_s = self._age_s + dt_s if thrusts is None else 0.0
@@ -308,7 +342,10 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the example from the command line; return its exit code."""
-    args = parser().parse_args(argv)
+    command_line = parser()
+    args = command_line.parse_args(argv)
+    if args.deterministic and args.stall_at < math.inf:
+        command_line.error("--stall-at needs real time: in virtual time no tick is ever late")
     flight = fly(
         policies(args),
         deterministic=args.deterministic,

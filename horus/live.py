@@ -6,6 +6,7 @@ import asyncio
 import contextvars
 import inspect
 import logging
+import threading
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -83,9 +84,12 @@ class LiveNode:
         """Whether the node is out of service: no tick begins."""
         self.removed = False
         """Whether the node was taken from the scheduler for good."""
+        self.abandoned = False
+        """Whether a thread or task that never returned may still hold this object."""
         self.skip_next = False
         self.in_episode = False
         self.callbacks = core.callbacks
+        self._claims = threading.Lock()
         self._restart_at_ns = 0
         self._backoff_ns = FIRST_BACKOFF_NS
         self._error_log = _Limiter()
@@ -220,9 +224,32 @@ class LiveNode:
             self.skip_next = self.in_episode = False
             self.tick_context.start_ns = self.tick_context.previous_ns = clock.NEVER
 
+    def claim_shutdown(self) -> bool:
+        """Return whether `shutdown()` is owed; the caller who hears yes must call it.
+
+        Thread: any.
+        """
+        with self._claims:
+            if not self.initialized:
+                return False
+            self.state = NodeState.STOPPING
+            return True
+
+    def successor(self) -> LiveNode:
+        """Return a fresh start for a node that was left behind.
+
+        Whatever still runs of the old one has no say in the new one.
+        """
+        fresh = LiveNode(self.node, self.timeline, self.control, self.sequence)
+        fresh.trigger = self.trigger
+        fresh.apply(self.spec)
+        self.control = _Nobody()
+        return fresh
+
     def stopped(self) -> None:
         """Enter the state that follows `shutdown()`."""
-        self.state = NodeState.STOPPED
+        if self.state is NodeState.STOPPING:
+            self.state = NodeState.STOPPED
         self.gated = True
 
     def regate(self) -> None:
@@ -338,6 +365,43 @@ class LiveNode:
             skipped=counters.skipped,
             errors=counters.errors,
         )
+
+
+class _Nobody:
+    """Listens to nothing: the control of a node that was left behind."""
+
+    def request_stop(self, reason: str) -> None:
+        pass
+
+    def fail(self, error: NodeError) -> None:
+        pass
+
+    def count_miss(self) -> None:
+        pass
+
+
+class EventTick:
+    """Sees to it that a tick of an event node uses up its message, exactly one.
+
+    Also if the tick does not ask for it. A node that was to restart first and
+    could not has not ticked: its message waits.
+    """
+
+    def __init__(self, live: LiveNode) -> None:
+        """Look at the node before the tick."""
+        assert live.trigger is not None
+        self._live = live
+        self._trigger = live.trigger
+        self._received = live.trigger.received
+        self._ticks = live.counters.ticks
+
+    def settle(self) -> None:
+        """Discard the message after the tick, if it was due and is still there."""
+        live = self._live
+        if live.state is NodeState.RESTARTING and live.counters.ticks == self._ticks:
+            return
+        if self._trigger.received == self._received:
+            self._trigger.discard()
 
 
 def never_awaited(phase: str) -> TypeError:

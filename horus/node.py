@@ -26,7 +26,7 @@ _TWO_WAYS = "is given both as an argument and as a method of the class; keep one
 class Node:
     """A unit of work that the scheduler ticks.
 
-    Either wrap plain functions::
+    Either wrap plain functions:
 
         Node("motor", tick=drive, rate=1000, order=20, budget=300 * us, subs=["cmd"])
 
@@ -319,8 +319,11 @@ class NodeCore:
         Raises:
             ConfigError: A topic was declared with another type before.
         """
-        for port in (*self.pubs, *self.subs):
-            bus.topic(port.topic).declare_type(port.type, self.spec.name)
+        ports = [(bus.topic(port.topic), port.type) for port in (*self.pubs, *self.subs)]
+        for topic, kind in ports:
+            topic.check_type(kind, self.spec.name)
+        for topic, kind in ports:
+            topic.declare_type(kind)
         self.disconnect()
         self._bus = bus
         for pub in self.pubs:
@@ -338,6 +341,8 @@ class NodeCore:
         """Close the ports; what was sent stays counted."""
         for subscription in self.inputs.values():
             subscription.close()
+        for publisher in self.outputs.values():
+            publisher.close()
         self.inputs.clear()
         self.outputs.clear()
 

@@ -54,6 +54,16 @@ class Registry:
             self._sort()
         return live
 
+    def renew(self) -> None:
+        """Get every node ready for `init()`: a session opens."""
+        with self._lock:
+            for name, live in self._by_name.items():
+                if live.abandoned:
+                    self._by_name[name] = live.successor()
+                else:
+                    live.renew()
+            self._sort()
+
     def __contains__(self, name: str) -> bool:
         """Return whether there is a node of that name."""
         return _checked(name) in self._by_name
@@ -78,16 +88,12 @@ class Registry:
         if names is None:
             return None
         if isinstance(names, str) or not isinstance(names, Iterable):
-            raise ConfigError("names", names, "must be a list of node names, e.g. ['motor']")
-        return [self.get(name) for name in names]
+            raise ConfigError("names", names, _names_remedy(names))
+        return [self.get(name) for name in dict.fromkeys(names)]
 
     def names(self) -> list[str]:
         """Return the names in execution order."""
         return [live.name for live in self.in_order]
-
-    def total_misses(self) -> int:
-        """Return how many deadlines were missed in all."""
-        return sum(live.counters.deadline_misses for live in self.in_order)
 
     def timing_report(self, now_ns: int) -> TimingReport:
         """Return a report on all nodes; `now_ns` is 0 when nothing runs."""
@@ -99,7 +105,7 @@ class Registry:
         counters = [live.counters for live in self.in_order]
         return {
             "budget_overruns": sum(each.budget_overruns for each in counters),
-            "deadline_misses": self.total_misses(),
+            "deadline_misses": sum(each.deadline_misses for each in counters),
             "watchdog_expirations": sum(each.watchdog_expirations for each in counters),
             "skipped": sum(each.skipped for each in counters),
             "health_states": {live.name: live.health.value for live in self.in_order},
@@ -135,6 +141,11 @@ def node_stats(live: LiveNode, now_ns: int) -> dict[str, Any]:
         "p99_start_latency": timing.start_latency_p99_s,
         "max_start_latency": timing.start_latency_max_s,
     }
+
+
+def _names_remedy(names: object) -> str:
+    example = names if isinstance(names, str) else "motor"
+    return f"must be a list of node names, e.g. [{example!r}]"
 
 
 def _checked(name: object) -> str:

@@ -300,7 +300,10 @@ class Scheduler:
             if publisher is None:
                 publisher = self._bus.topic(topic).publisher(_APPLICATION)
                 self._publishers[topic] = publisher
-            publisher.send(message)
+        # Copied outside the lock: a large message must not hold up a small one.
+        frozen = publisher.isolate(message)
+        with self._publish_lock:
+            publisher.deliver(frozen)
 
     def subscribe(self, topic: str | type, capacity: int = DEFAULT_CAPACITY) -> MessageStream:
         """Return the messages of a topic from now on: `async for message in stream`.
@@ -308,9 +311,8 @@ class Scheduler:
         Raises:
             TopicError: The topic name was refused.
         """
-        stream = MessageStream(self._bus.subscribe(topic, _APPLICATION, capacity))
-        self._session.add_stream(stream)
-        return stream
+        subscription = self._bus.subscribe(topic, _APPLICATION, capacity)
+        return self._session.open_stream(subscription)
 
     # -- introspection ----------------------------------------------------------------
 

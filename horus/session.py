@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 
 from horus import clock, logs
 from horus.clock import MonotonicClock, SimClock, Timeline
@@ -21,7 +22,7 @@ from horus.loop.stepping import Stepper
 from horus.registry import Registry
 from horus.spec import SchedulerSpec
 from horus.stream import MessageStream
-from horus.topics import Bus
+from horus.topics import Bus, Subscription
 from horus.units import to_s
 
 
@@ -29,14 +30,17 @@ class Session:
     """Drives a scheduler's nodes between their `init()` and their `shutdown()`.
 
     A session opens with the first run or step and closes with `shutdown()` of
-    every node: at the end of a run, or at `close` after steps. Three things can
+    every node: at the end of a run, or at `stop` after steps. Three things can
     drive the nodes, and never two at a time:
 
     - a `Runtime`: in real time, on an event loop and the nodes' own threads;
     - a `Stepper`: one cycle at a time on the calling thread;
     - a `Simulation`, which is a stepper in virtual time: deterministic mode.
 
-    Thread: any; those who run the nodes exclude each other.
+    Event loop and threads stay for as long as the session does, so that what
+    `init()` opened works in every `tick_for`.
+
+    Thread: any; those who drive the nodes exclude each other.
     """
 
     def __init__(self, spec: SchedulerSpec) -> None:
@@ -50,16 +54,17 @@ class Session:
             seed=spec.seed if spec.deterministic else None,
         )
         self.registry = Registry(self.bus, self.timeline)
-        self.control = RunControl(spec.max_deadline_misses, self.registry.total_misses)
+        self.control = RunControl(spec.max_deadline_misses)
         self.status = "idle"
         self._lock = threading.Lock()
         self._open = False
         self._idle = threading.Event()
         self._idle.set()
         self._driving_thread: int | None = None
+        self._loop: StepLoop | None = None
         self._runtime: Runtime | None = None
         self._stepper: Stepper | None = None
-        self._streams: list[MessageStream] = []
+        self._streams: set[MessageStream] = set()
 
     @property
     def running(self) -> bool:
@@ -90,39 +95,37 @@ class Session:
         with self._driving(owns_process=not keeps_open, keeps_open=keeps_open):
             if self._spec.deterministic:
                 self._simulate(duration_ns, only)
-                return
-            runtime = self._start_runtime()
-            loop = StepLoop(_loop_factory(self._spec.loop)())
-            try:
-                loop.run(
-                    runtime.run(
-                        lambda: self.registry.in_order if only is None else only,
-                        duration_ns,
-                        shut_down_after=not keeps_open,
-                    )
-                )
-            finally:
-                self._runtime = None
-                loop.close()
+            else:
+                runtime = self._start_runtime()
+                members = self._all if only is None else lambda: only
+                self._private_loop().run(runtime.play(members, duration_ns))
 
     async def arun(self, duration_ns: int | None) -> None:
-        """Run on the running event loop until stopped, cancelled, or for a time [ns]."""
+        """Run on the running event loop until stopped, cancelled, or for a time [ns].
+
+        Nodes that steps have initialised elsewhere are shut down first.
+        """
+        self.close_if_idle()
         with self._driving(owns_process=False):
             if self._spec.deterministic:
                 await self._simulate_beside_loop(duration_ns)
                 return
             runtime = self._start_runtime()
             try:
-                await runtime.run(lambda: self.registry.in_order, duration_ns)
+                await runtime.play(self._all, duration_ns)
+            except asyncio.CancelledError:
+                self.control.request_stop("cancelled")
+                raise
             finally:
+                self.control.end()
+                await runtime.close()
                 self._runtime = None
 
     def step(self, only: list[LiveNode] | None) -> None:
         """Run one cycle on the calling thread; the nodes stay initialised."""
         self._take_charge()
         try:
-            stepper = self._stepper or self._open_stepper()
-            stepper.cycle(self._stopping, only)
+            self._open_stepper().cycle(only)
         finally:
             self._hand_back(keeps_open=True)
 
@@ -130,9 +133,16 @@ class Session:
         """End the run in order; without one, shut down what steps have initialised."""
         if self.running:
             self.control.request_stop(reason)
-            return
-        self._close()
-        self.status = "stopped"
+        else:
+            self.close_if_idle()
+            self.status = "stopped"
+
+    def close_if_idle(self) -> None:
+        """Shut the nodes down, unless they are being run."""
+        with self._lock:
+            if self.running:
+                return
+            self._close()
 
     def wait_until_idle(self) -> None:
         """Wait for the end of a run on another thread."""
@@ -148,18 +158,17 @@ class Session:
     # -- nodes that come, change and go ------------------------------------------------
 
     def joined(self, live: LiveNode) -> None:
-        """Let a node that was added take part."""
-        if self._runtime is not None:
+        """Let a node that was added take part: now, or from the next run or step on."""
+        if self.running and self._runtime is not None:
             self._runtime.add(live)
-        elif self._stepper is not None:
+        elif self.running and self._stepper is not None:
             self._stepper.add(live)
 
     def retimed(self, live: LiveNode) -> None:
         """Adopt a node's changed rate."""
-        if self._runtime is not None:
-            self._runtime.retime(live)
-        elif self._stepper is not None:
-            self._stepper.retime(live)
+        for driver in (self._runtime, self._stepper):
+            if driver is not None:
+                driver.retime(live)
 
     def leave(self, live: LiveNode) -> None:
         """Shut down a node that was removed, and wait for it unless that would wait for ourselves.
@@ -167,24 +176,17 @@ class Session:
         Raises:
             ShutdownTimeout: Its tick or its `shutdown()` did not end in time.
         """
-        runtime = self._runtime
-        if runtime is None:
-            if self._stepper is not None:
-                self._stepper.remove(live)
-            return
-        removed = runtime.remove(live)
-        if removed.done() or runtime.is_home(live):
-            return
-        timeout_s = to_s(self._spec.shutdown_timeout_ns)
-        try:
-            removed.result(timeout_s)
-        except TimeoutError:
-            raise ShutdownTimeout(live.name, timeout_s) from None
+        live.removed = True
+        if self._runtime is not None:
+            self._wait_for(live, self._runtime)
+        if self._stepper is not None:
+            self._stepper.remove(live)
 
-    def add_stream(self, stream: MessageStream) -> None:
-        """End an application's stream when the session closes."""
-        with self._lock:
-            self._streams.append(stream)
+    def open_stream(self, subscription: Subscription) -> MessageStream:
+        """Return a stream that ends with the session."""
+        stream = MessageStream(subscription, self._streams.discard)
+        self._streams.add(stream)
+        return stream
 
     # -- internals ---------------------------------------------------------------------
 
@@ -200,7 +202,11 @@ class Session:
             if owns_process:
                 around.enter_context(stop_on_signals(self.control.request_stop))
             around.callback(self._hand_back, keeps_open=keeps_open)
-            yield
+            try:
+                yield
+            except KeyboardInterrupt:
+                self.control.request_stop("KeyboardInterrupt")
+                raise
 
     def _become_idle(self) -> None:
         self._driving_thread = None
@@ -218,21 +224,22 @@ class Session:
                     f"scheduler {self._spec.name!r} is already running; "
                     "stop it first, or use a second scheduler"
                 )
+            if self._runtime is not None:
+                self._runtime.rearm()
             # Before the status tells anybody: a stop that comes now must count.
             self.control.begin(self._end_run)
             self.status = "running"
         if not self._open:
             self._open = True
-            for live in self.registry.in_order:
-                live.renew()
+            self.registry.renew()
 
     def _hand_back(self, *, keeps_open: bool) -> None:
         """Let others run the nodes; unless they stay initialised, they are shut down."""
+        self.control.end()
         try:
             if not keeps_open or self.control.failure is not None:
                 self._close()
         finally:
-            self.control.end()
             self.status = "idle" if self._open else "stopped"
 
     def _close(self) -> None:
@@ -240,23 +247,37 @@ class Session:
         if not self._open:
             return
         self._open = False
-        stepper = self._stepper or Stepper(self.timeline)
-        stepper.shut_down(self.registry.in_order)
-        self._close_stepper(stepper)
-        for live in self.registry.in_order:
-            live.counters.end_span(live.period_ns)
-        with self._lock:
-            streams, self._streams = self._streams, []
-        for stream in streams:
-            stream.close()
-        clock.clear_ambient(self.timeline)
+        try:
+            if self._runtime is not None:
+                self._private_loop().run(self._runtime.close())
+        finally:
+            self._runtime = None
+            stepper = self._stepper or Stepper(self.timeline, self._private_loop, self._stopping)
+            self._stepper = None
+            stepper.shut_down(self.registry.in_order)
+            stepper.close()
+            if self._loop is not None:
+                self._loop.close()
+                self._loop = None
+            for live in self.registry.in_order:
+                live.counters.end_span(live.period_ns)
+            for stream in tuple(self._streams):
+                stream.close()
+            clock.clear_ambient(self.timeline)
+
+    def _all(self) -> tuple[LiveNode, ...]:
+        return self.registry.in_order
+
+    def _private_loop(self) -> StepLoop:
+        if self._loop is None:
+            self._loop = StepLoop(_loop_factory(self._spec.loop)())
+        return self._loop
 
     def _start_runtime(self) -> Runtime:
-        """Go over from steps to a run; the nodes stay as they are."""
-        self._close_stepper(self._stepper)
-        self._runtime = Runtime(
-            self._spec.name, self.timeline, make_executors, self._spec.shutdown_timeout_ns
-        )
+        if self._runtime is None:
+            self._runtime = Runtime(
+                self._spec.name, self.timeline, make_executors, self._spec.shutdown_timeout_ns
+            )
         if self.control.stopping:
             self._runtime.request_stop()
         return self._runtime
@@ -264,24 +285,18 @@ class Session:
     def _open_stepper(self) -> Stepper:
         if self._stepper is None:
             if self._sim_clock is None:
-                stepper = Stepper(self.timeline)
+                self._stepper = Stepper(self.timeline, self._private_loop, self._stopping)
             else:
-                stepper = Simulation(self.timeline, self._sim_clock)
-            stepper.start(self.registry.in_order)
-            self._stepper = stepper
+                self._stepper = Simulation(self.timeline, self._sim_clock, self._stopping)
+        self._stepper.take_on(self.registry.in_order)
         return self._stepper
-
-    def _close_stepper(self, stepper: Stepper | None) -> None:
-        self._stepper = None
-        if stepper is not None:
-            stepper.close()
 
     def _simulate(self, duration_ns: int | None, only: list[LiveNode] | None) -> None:
         """Run in virtual time on the calling thread."""
         simulation = self._open_stepper()
         assert isinstance(simulation, Simulation)
         until_ns = None if duration_ns is None else self.timeline.now_ns() + duration_ns
-        simulation.advance(until_ns, self._stopping, only)
+        simulation.advance(until_ns, only)
 
     async def _simulate_beside_loop(self, duration_ns: int | None) -> None:
         """Run in virtual time on a thread, so that the application's loop stays free."""
@@ -290,6 +305,7 @@ class Session:
             try:
                 self._simulate(duration_ns, None)
             finally:
+                self.control.end()
                 self._close()
 
         simulation = asyncio.ensure_future(asyncio.to_thread(simulate))
@@ -300,12 +316,30 @@ class Session:
             await asyncio.wait([simulation])
             raise
 
+    def _wait_for(self, live: LiveNode, runtime: Runtime) -> None:
+        """Wait until a node has left the runtime."""
+        removed = runtime.remove(live)
+        if not self.running and not removed.done():
+            # Between two runs the loop stands still unless we run it.
+            self._private_loop().run(_done(removed))
+        if removed.done() or runtime.is_home(live):
+            return
+        timeout_s = 3 * to_s(self._spec.shutdown_timeout_ns)
+        try:
+            removed.result(timeout_s)
+        except TimeoutError:
+            raise ShutdownTimeout(live.name, timeout_s) from None
+
     def _end_run(self) -> None:
         if self._runtime is not None:
             self._runtime.request_stop()
 
     def _stopping(self) -> bool:
         return self.control.stopping
+
+
+async def _done(future: Future[None]) -> None:
+    await asyncio.wrap_future(future)
 
 
 def _loop_factory(kind: str) -> Callable[[], asyncio.AbstractEventLoop]:

@@ -19,20 +19,21 @@ import decimal
 import enum
 import fractions
 import functools
+import itertools
 import operator
 import pathlib
 import re
 import sys
 import types
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import msgspec
 
 Thaw = Callable[[Any], Any] | None
 Frozen = tuple[Any, Thaw]
-Freezer = Callable[[Any], Frozen]
+Freezer = Callable[[Any, int], Frozen]
 
 ATOMS: frozenset[type] = frozenset(
     {
@@ -44,9 +45,7 @@ ATOMS: frozenset[type] = frozenset(
         str,
         bytes,
         range,
-        slice,
         type(Ellipsis),
-        frozenset,
         datetime.date,
         datetime.datetime,
         datetime.time,
@@ -69,6 +68,7 @@ _encode = msgspec.msgpack.Encoder().encode
 _LONG_LIST = 16
 _MSGPACK_FLOAT64 = b"\xcb"
 _MSGPACK_FLOAT64_SIZE = 9
+_MAX_DEPTH = 8
 _UNSENDABLE = (
     types.FunctionType,
     types.BuiltinFunctionType,
@@ -85,46 +85,63 @@ _UNSENDABLE = (
 class UnsendableError(TypeError):
     """A value that cannot be isolated; the bus adds the topic to the message."""
 
+    path = ""
+    """Where in the message it is, e.g. `['map']['cells'][3]`."""
 
-def freeze(value: Any) -> Frozen:
+    def inside(self, key: object) -> UnsendableError:
+        """Take note of the container's key on the way up."""
+        self.path = f"[{key!r}]{self.path}"
+        return self
+
+
+def freeze(value: Any, depth: int = 0) -> Frozen:
     """Return a private copy of `value` and how to copy it for a receiver.
 
     Raises:
         UnsendableError: `value`, or something in it, cannot be copied.
-        RecursionError: `value` contains itself.
+        RecursionError: It is nested too deeply.
     """
     kind = type(value)
     if kind in ATOMS:
         return value, None
-    return (_freezers.get(kind) or _freezer_for(kind))(value)
+    if depth > _MAX_DEPTH:
+        # deepcopy remembers what it has copied: a structure whose parts are
+        # shared again and again would otherwise take time without end.
+        _refuse_cycles(value, set(), set())
+        return _freeze_deep(value, depth)
+    return (_freezers.get(kind) or _freezer_for(kind))(value, depth)
 
 
-def _freeze_dict(value: dict[Any, Any]) -> Frozen:
-    # Keys are hashable and thereby immutable as far as Python can tell.
-    if _all_atoms(map(type, value.values())):
+def _freeze_dict(value: dict[Any, Any], depth: int) -> Frozen:
+    if _all_atoms(map(type, itertools.chain(value, value.values()))):
         return value.copy(), dict.copy
+    if not _all_immutable(value, depth):
+        return _freeze_deep(value, depth)
     payload = {}
     thaws = []
     for key, item in value.items():
-        payload[key], thaw = freeze(item)
+        try:
+            payload[key], thaw = freeze(item, depth + 1)
+        except UnsendableError as exc:
+            raise exc.inside(key)  # noqa: B904 - the same exception, on its way up
         if thaw is not None:
             thaws.append((key, thaw))
     return payload, functools.partial(_thaw_items, tuple(thaws)) if thaws else dict.copy
 
 
-def _freeze_list(value: list[Any]) -> Frozen:
+def _freeze_list(value: list[Any], depth: int) -> Frozen:
     if _is_long_float_list(value) or _all_atoms(map(type, value)):
         return value.copy(), list.copy
-    payload, thaws = _freeze_sequence(value)
+    payload, thaws = _freeze_sequence(value, depth)
     return payload, functools.partial(_thaw_items, thaws) if thaws else list.copy
 
 
 def _is_long_float_list(value: list[Any]) -> bool:
     """Return whether this is a long list of nothing but floats, as laser scans are.
 
-    Looking at the type of each item costs 20 ns a beam. Encoding to MessagePack
-    looks at them all in C for a fifth of that, and tells: a float is the only
-    thing that becomes a 0xcb byte and eight more (the encoder refuses subclasses).
+    Looking at the type of each item takes time. Encoding to MessagePack looks at
+    them all in C, several times faster, and tells: a float is the only thing that
+    becomes a 0xcb byte and eight more (the encoder refuses subclasses).
     """
     count = len(value)
     if count < _LONG_LIST or type(value[0]) is not float or type(value[-1]) is not float:
@@ -133,35 +150,34 @@ def _is_long_float_list(value: list[Any]) -> bool:
         encoded = _encode(value)
     except (TypeError, ValueError, OverflowError, RecursionError):
         return False
-    body = len(encoded) - _MSGPACK_FLOAT64_SIZE * count
-    if body not in (3, 5):
+    header = len(encoded) - _MSGPACK_FLOAT64_SIZE * count
+    if header not in (3, 5):
         return False
-    return encoded[body::_MSGPACK_FLOAT64_SIZE] == _MSGPACK_FLOAT64 * count
+    return encoded[header::_MSGPACK_FLOAT64_SIZE] == _MSGPACK_FLOAT64 * count
 
 
-def _freeze_sequence(value: Any) -> tuple[list[Any], tuple[tuple[int, Any], ...]]:
+def _freeze_sequence(value: Any, depth: int) -> tuple[list[Any], tuple[tuple[int, Any], ...]]:
     payload = []
     thaws = []
     for index, item in enumerate(value):
-        frozen, thaw = freeze(item)
+        try:
+            frozen, thaw = freeze(item, depth + 1)
+        except UnsendableError as exc:
+            raise exc.inside(index)  # noqa: B904 - the same exception, on its way up
         payload.append(frozen)
         if thaw is not None:
             thaws.append((index, thaw))
     return payload, tuple(thaws)
 
 
-def _freeze_tuple(value: tuple[Any, ...]) -> Frozen:
+def _freeze_tuple(value: tuple[Any, ...], depth: int) -> Frozen:
     if _all_atoms(map(type, value)):
         return value, None
-    payload, thaws = _freeze_sequence(value)
-    if all(map(operator.is_, payload, value)):
+    payload, thaws = _freeze_sequence(value, depth)
+    if not thaws and all(map(operator.is_, payload, value)):
         return value, None
-    build = _tuple_builder(type(value))
+    build = getattr(type(value), "_make", type(value))
     return build(payload), functools.partial(_thaw_tuple, build, thaws) if thaws else None
-
-
-def _tuple_builder(kind: type) -> Callable[[list[Any]], Any]:
-    return getattr(kind, "_make", kind)
 
 
 def _thaw_items(thaws: tuple[tuple[Any, Any], ...], payload: Any) -> Any:
@@ -177,45 +193,111 @@ def _thaw_tuple(
     return build(_thaw_items(thaws, list(payload)))
 
 
-def _freeze_bytearray(value: bytearray) -> Frozen:
+def _freeze_bytearray(value: bytearray, depth: int) -> Frozen:
     return bytes(value), bytearray
 
 
-def _freeze_set(value: set[Any]) -> Frozen:
-    return value.copy(), set.copy
+def _freeze_set(value: set[Any], depth: int) -> Frozen:
+    if _all_immutable(value, depth):
+        return value.copy(), set.copy
+    return _freeze_deep(value, depth)
 
 
-def _freeze_array(value: Any) -> Frozen:
+def _freeze_frozenset(value: frozenset[Any], depth: int) -> Frozen:
+    return (value, None) if _all_immutable(value, depth) else _freeze_deep(value, depth)
+
+
+def _all_immutable(hashables: Iterable[Any], depth: int) -> bool:
+    """Return whether keys or elements may be shared: hashable does not mean immutable."""
+    return all(type(item) in ATOMS or _is_same(freeze(item, depth + 1), item) for item in hashables)
+
+
+def _is_same(frozen: Frozen, original: Any) -> bool:
+    return frozen[0] is original and frozen[1] is None
+
+
+def _freeze_array(value: Any, depth: int) -> Frozen:
     if value.dtype.hasobject:
         raise UnsendableError("a NumPy array of Python objects; send a list or a numeric array")
     payload = value.copy()
     payload.flags.writeable = False
-    return payload, None
+    # Each receiver gets a view of its own: the shape and the flags of an array
+    # can be changed in place, and a view of a read-only array stays read-only.
+    return payload, type(payload).view
 
 
-def _freeze_by_reference(value: Any) -> Frozen:
+def _freeze_by_reference(value: Any, depth: int) -> Frozen:
     return value, None
 
 
-def _freeze_fields(names: tuple[str, ...], value: Any) -> Frozen:
-    payload = copy.copy(value)
+def _freeze_struct(frozen_type: bool, value: Any, depth: int) -> Frozen:
+    fields = [(name, getattr(value, name)) for name in value.__struct_fields__]
+    changed, thaws = _freeze_fields(fields, depth)
+    if frozen_type and not changed:
+        return value, None
+    return _with_fields(copy.copy(value), changed), functools.partial(
+        _thaw_fields, copy.copy, tuple(thaws)
+    )
+
+
+def _freeze_instance(slots: tuple[str, ...], frozen_type: bool, value: Any, depth: int) -> Frozen:
+    fields = _attributes(slots, value)
+    changed, thaws = _freeze_fields(fields, depth)
+    if frozen_type and not changed:
+        return value, None
+    duplicate = functools.partial(_copy_instance, slots)
+    return _with_fields(duplicate(value), changed), functools.partial(
+        _thaw_fields, duplicate, tuple(thaws)
+    )
+
+
+def _freeze_fields(
+    fields: list[tuple[str, Any]], depth: int
+) -> tuple[list[tuple[str, Any]], list[tuple[str, Any]]]:
+    """Return the fields whose frozen value is another object, and those to thaw."""
+    changed = []
     thaws = []
-    for name in names:
-        frozen, thaw = freeze(getattr(value, name))
-        setattr(payload, name, frozen)
+    for name, item in fields:
+        try:
+            frozen, thaw = freeze(item, depth + 1)
+        except UnsendableError as exc:
+            raise exc.inside(name)  # noqa: B904 - the same exception, on its way up
+        if frozen is not item or thaw is not None:
+            changed.append((name, frozen))
         if thaw is not None:
             thaws.append((name, thaw))
-    return payload, functools.partial(_thaw_fields, tuple(thaws))
+    return changed, thaws
 
 
-def _thaw_fields(thaws: tuple[tuple[str, Any], ...], payload: Any) -> Any:
-    fresh = copy.copy(payload)
-    for name, thaw in thaws:
-        setattr(fresh, name, thaw(getattr(fresh, name)))
-    return fresh
+def _thaw_fields(
+    duplicate: Callable[[Any], Any], thaws: tuple[tuple[str, Any], ...], payload: Any
+) -> Any:
+    fresh = duplicate(payload)
+    return _with_fields(fresh, [(name, thaw(getattr(fresh, name))) for name, thaw in thaws])
 
 
-def _freeze_deep(value: Any) -> Frozen:
+def _with_fields(instance: Any, fields: list[tuple[str, Any]]) -> Any:
+    # Past the class's own __setattr__: frozen classes and validators refuse.
+    assign = msgspec.structs.force_setattr if isinstance(instance, msgspec.Struct) else _set
+    for name, item in fields:
+        assign(instance, name, item)
+    return instance
+
+
+_set = object.__setattr__
+
+
+def _copy_instance(slots: tuple[str, ...], value: Any) -> Any:
+    return _with_fields(object.__new__(type(value)), _attributes(slots, value))
+
+
+def _attributes(slots: tuple[str, ...], value: Any) -> list[tuple[str, Any]]:
+    """Return all that an instance holds, declared as a field or not."""
+    held = [(name, getattr(value, name)) for name in slots if hasattr(value, name)]
+    return [*getattr(value, "__dict__", {}).items(), *held]
+
+
+def _freeze_deep(value: Any, depth: int) -> Frozen:
     try:
         return copy.deepcopy(value), copy.deepcopy
     except RecursionError:
@@ -224,7 +306,20 @@ def _freeze_deep(value: Any) -> Frozen:
         raise UnsendableError(f"copying it failed with {type(exc).__name__}: {exc}") from exc
 
 
-def _refuse(value: Any) -> Frozen:
+def _refuse_cycles(value: Any, above: set[int], known: set[int]) -> None:
+    """Refuse a container that is inside itself."""
+    if not isinstance(value, dict | list | tuple) or id(value) in known:
+        return
+    if id(value) in above:
+        raise UnsendableError("it contains itself")
+    above.add(id(value))
+    for item in value.values() if isinstance(value, dict) else value:
+        _refuse_cycles(item, above, known)
+    above.remove(id(value))
+    known.add(id(value))
+
+
+def _refuse(value: Any, depth: int) -> Frozen:
     raise UnsendableError(f"a {type(value).__name__} is code or a resource, not data")
 
 
@@ -233,6 +328,7 @@ _freezers: dict[type, Freezer] = {
     list: _freeze_list,
     tuple: _freeze_tuple,
     set: _freeze_set,
+    frozenset: _freeze_frozenset,
     bytearray: _freeze_bytearray,
 }
 
@@ -246,10 +342,11 @@ def _freezer_for(kind: type) -> Freezer:
 
 def _choose(kind: type) -> Freezer:
     numpy = sys.modules.get("numpy")
-    if numpy is not None and issubclass(kind, numpy.ndarray):
-        return _freeze_array
-    if numpy is not None and issubclass(kind, numpy.generic):
-        return _freeze_by_reference
+    if numpy is not None:
+        if kind is numpy.ndarray:
+            return _freeze_array
+        if issubclass(kind, numpy.generic) and not issubclass(kind, numpy.void):
+            return _freeze_by_reference
     if issubclass(kind, enum.Enum):
         return _freeze_by_reference
     if issubclass(kind, _UNSENDABLE):
@@ -257,12 +354,24 @@ def _choose(kind: type) -> Freezer:
     if issubclass(kind, tuple) and hasattr(kind, "_make"):
         return _freeze_tuple
     if issubclass(kind, msgspec.Struct):
-        if kind.__struct_config__.frozen:
-            return _freeze_by_reference
-        return functools.partial(_freeze_fields, kind.__struct_fields__)
-    if dataclasses.is_dataclass(kind):
-        if kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
-            return _freeze_by_reference
-        names = tuple(field.name for field in dataclasses.fields(kind))
-        return functools.partial(_freeze_fields, names)
+        return functools.partial(_freeze_struct, bool(kind.__struct_config__.frozen))
+    if dataclasses.is_dataclass(kind) and _is_plain(kind):
+        slots = tuple(
+            name
+            for base in kind.__mro__
+            for name in _as_tuple(base.__dict__.get("__slots__", ()))
+            if name not in ("__dict__", "__weakref__")
+        )
+        frozen = bool(kind.__dataclass_params__.frozen)  # type: ignore[attr-defined]
+        return functools.partial(_freeze_instance, slots, frozen)
     return _freeze_deep
+
+
+def _is_plain(kind: type) -> bool:
+    """Return whether an instance is nothing but its attributes."""
+    hooks = ("__new__", "__reduce__", "__reduce_ex__", "__copy__", "__deepcopy__")
+    return all(getattr(kind, hook, None) is getattr(object, hook, None) for hook in hooks)
+
+
+def _as_tuple(slots: str | Iterable[str]) -> tuple[str, ...]:
+    return (slots,) if isinstance(slots, str) else tuple(slots)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
+from horus.errors import StateError
 from horus.topics import Subscription
 
 
@@ -20,8 +22,11 @@ class MessageStream:
     Thread: any one thread, and any event loop; messages may come from all threads.
     """
 
-    def __init__(self, subscription: Subscription) -> None:
+    def __init__(
+        self, subscription: Subscription, on_close: Callable[[MessageStream], None]
+    ) -> None:
         """Listen on `subscription`, which becomes this stream's own."""
+        self._on_close = on_close
         self._subscription = subscription
         self._lock = threading.Lock()
         self._waiter: asyncio.Future[None] | None = None
@@ -43,8 +48,10 @@ class MessageStream:
 
     def close(self) -> None:
         """Receive nothing more; an iteration ends after what still waits."""
-        self._subscription.close()
-        self._ended = True
+        if not self._ended:
+            self._subscription.close()
+            self._ended = True
+            self._on_close(self)
         self._wake()
 
     def __aiter__(self) -> MessageStream:
@@ -61,6 +68,8 @@ class MessageStream:
                 raise StopAsyncIteration
             waiter = asyncio.get_running_loop().create_future()
             with self._lock:
+                if self._waiter is not None and not self._waiter.done():
+                    raise StateError("two tasks iterate over one stream; subscribe once for each")
                 self._waiter = waiter
             # Looked at again now that senders can see the waiter.
             if not self._subscription.queue and not self._ended:

@@ -92,11 +92,12 @@ def build_async_tick(live: LiveNode) -> RunTickAsync:
                 raise
             error = exc
         except BaseException as exc:
+            if _is_interrupt(exc):
+                live.control.request_stop("KeyboardInterrupt")
+                raise
             error = exc
         if finish(release_ns, start_ns, error):
-            live.run_phase("safe_state")
-        # The exception's traceback refers to this frame: let go of it, or each
-        # failed tick leaves a cycle to the garbage collector.
+            await live.run_phase_async("safe_state")
         error = None
 
     return run_tick

@@ -57,6 +57,7 @@ class Subscription:
     __slots__ = (
         "_already_sent",
         "_overflowing",
+        "_sent_until",
         "capacity",
         "owner",
         "queue",
@@ -74,6 +75,7 @@ class Subscription:
         self.received = 0
         self.wake: Callable[[], None] | None = None
         self._already_sent = topic.sent
+        self._sent_until: int | None = None
         self._overflowing = False
 
     @property
@@ -81,7 +83,8 @@ class Subscription:
         """How many messages gave way to newer ones unread."""
         # Derived rather than counted: any thread may send, and an increment
         # shared between threads loses counts.
-        arrived = self.topic.sent - self._already_sent
+        sent = self.topic.sent if self._sent_until is None else self._sent_until
+        arrived = sent - self._already_sent
         return max(0, arrived - self.received - len(self.queue))
 
     def take(self) -> Any:
@@ -105,12 +108,9 @@ class Subscription:
             messages.append(message)
         return messages
 
-    def consume_one_since(self, received: int) -> None:
-        """Discard the oldest message, unless some were received since the count was `received`.
-
-        One tick per message, also for a tick that did not ask for its message.
-        """
-        if self.received == received and self.queue:
+    def discard(self) -> None:
+        """Drop the oldest message as if it had been received."""
+        if self.queue:
             self.queue.popleft()
             self.received += 1
 
@@ -131,6 +131,8 @@ class Subscription:
     def close(self) -> None:
         """Stop receiving."""
         self.topic.unsubscribe(self)
+        if self._sent_until is None:
+            self._sent_until = self.topic.sent
 
 
 class Publisher:
@@ -154,6 +156,16 @@ class Publisher:
             TopicError: The message has another type than the topic declares, is
                 None, or cannot be isolated.
         """
+        self.deliver(self.isolate(message))
+
+    def isolate(self, message: Any) -> Frozen:
+        """Check a message and take the copy that will be delivered.
+
+        Raises:
+            TopicError: See `send`.
+
+        Thread: any.
+        """
         topic = self.topic
         if topic.type is not None and not topic.accepts(message):
             raise TopicError(
@@ -165,7 +177,11 @@ class Publisher:
                 f"topic {topic.name!r}: {self.owner} sent None, which is what recv() returns "
                 "when there is nothing; send a value such as True or {}"
             )
-        frozen = (message, None) if type(message) in ATOMS else self._freeze(message)
+        return (message, None) if type(message) in ATOMS else self._freeze(message)
+
+    def deliver(self, frozen: Frozen) -> None:
+        """Append an isolated message to every subscription's queue."""
+        topic = self.topic
         self.sent += 1
         topic.newest = frozen
         for subscription in topic.subscriptions:
@@ -180,17 +196,27 @@ class Publisher:
             for tap in topic.taps:
                 tap(sent)
 
+    def close(self) -> None:
+        """Take the sender away from the topic; what it sent stays counted."""
+        self.topic.retire(self)
+
     def _freeze(self, message: Any) -> Frozen:
+        where = ""
+        cause: Exception
         try:
             return freeze(message)
         except UnsendableError as exc:
-            reason = str(exc)
-        except RecursionError:
-            reason = "it contains itself or is nested too deeply"
+            where = f" (in {exc.path})" if exc.path else ""
+            reason, cause = str(exc), exc
+        except RecursionError as exc:
+            reason, cause = "it contains itself or is nested too deeply", exc
+        except Exception as exc:
+            # Code of the message's own class, e.g. a property that raises.
+            reason, cause = f"{type(exc).__name__}: {exc}", exc
         raise TopicError(
             f"topic {self.topic.name!r}: {self.owner} sent a {type(message).__name__} "
-            f"that cannot be isolated: {reason}"
-        )
+            f"that cannot be isolated: {reason}{where}"
+        ) from cause
 
 
 class Topic:
@@ -206,11 +232,12 @@ class Topic:
         self.taps: tuple[Tap, ...] = ()
         self._lock = lock
         self._accepted: tuple[type, ...] = (object,)
+        self._sent_by_retired = 0
 
     @property
     def sent(self) -> int:
         """How many messages were sent."""
-        return sum(publisher.sent for publisher in self.publishers)
+        return self._sent_by_retired + sum(publisher.sent for publisher in self.publishers)
 
     def latest(self) -> Any:
         """Return the newest message, received or not; None before the first."""
@@ -220,23 +247,25 @@ class Topic:
         payload, thaw = newest
         return payload if thaw is None else thaw(payload)
 
-    def declare_type(self, kind: type | None, owner: str) -> None:
-        """Fix the type of the messages.
+    def check_type(self, kind: type | None, owner: str) -> None:
+        """Refuse a declaration that contradicts an earlier one.
 
         Raises:
             ConfigError: Somebody else has declared another type.
         """
-        if kind is None or kind is self.type:
-            return
-        if self.type is not None:
+        if kind is not None and self.type not in (None, kind):
             raise ConfigError(
                 "type",
                 kind,
-                f"topic {self.name!r} was declared with {self.type.__name__} before {owner}; "
-                "all who declare a type must name the same",
+                f"topic {self.name!r} carries {self.type.__name__}, as was declared before "
+                f"{owner}; all who declare a type must name the same",
             )
-        self.type = kind
-        self._accepted = (int, float) if kind is float else (kind,)
+
+    def declare_type(self, kind: type | None) -> None:
+        """Fix the type of the messages."""
+        if kind is not None:
+            self.type = kind
+            self._accepted = (int, float) if kind is float else (kind,)
 
     def accepts(self, message: Any) -> bool:
         """Return whether `message` is of the declared type; an int is a fine float."""
@@ -248,6 +277,14 @@ class Topic:
             publisher = Publisher(self, owner)
             self.publishers = (*self.publishers, publisher)
             return publisher
+
+    def retire(self, publisher: Publisher) -> None:
+        """Take a sender's end away; unknown ones are ignored."""
+        with self._lock:
+            rest = tuple(other for other in self.publishers if other is not publisher)
+            if len(rest) < len(self.publishers):
+                self._sent_by_retired += publisher.sent
+                self.publishers = rest
 
     def subscribe(self, owner: str, capacity: int) -> Subscription:
         """Return a new, empty subscription."""

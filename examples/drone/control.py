@@ -132,9 +132,7 @@ class Stabiliser:
             if flying:
                 trim = self._trim[axis] + RATE_INTEGRAL_PER_S2[axis] * error * dt_s
                 self._trim[axis] = clamp(trim, MAX_TRIM_RADPS2)
-            torque.append(
-                INERTIA_KGM2[axis] * (RATE_GAIN_PER_S[axis] * error + self._trim[axis])
-            )
+            torque.append(INERTIA_KGM2[axis] * (RATE_GAIN_PER_S[axis] * error + self._trim[axis]))
         return mix(setpoint.thrust_n, (torque[0], torque[1], torque[2]))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
 
 SIDE_M = 4.0
 HEIGHT_M = 2.0
-BELOW_GROUND_M = 0.25
+BELOW_GROUND_M = 0.12
 """The landing aims below the ground, so that the drone settles on it and does not hover over it."""
 
 
@@ -29,10 +30,12 @@ class Waypoint:
 
 
 ARRIVED_M = 0.25
+PREVIEW_S = 0.15
+"""How long the drone takes to tilt: who asks for an acceleration now gets it so much later."""
 RESTING_MPS = 0.12
 
 STANDING = "standing"
-"""What the time before the first waypoint is called."""
+"""What the time before the first waypoint is called; there is nowhere to arrive at."""
 
 START_M: Vector = (0.0, 0.0, REST_HEIGHT_M)
 CORNERS_M: tuple[Vector, ...] = (
@@ -64,6 +67,7 @@ class Reference:
     position_m: Vector
     velocity_mps: Vector
     acceleration_mps2: Vector
+    """`PREVIEW_S` later."""
 
 
 class Leg:
@@ -84,7 +88,8 @@ class Leg:
         t = max(0.0, min(time_s / self._duration_s, 1.0))
         share = t * t * t * (10.0 + t * (6.0 * t - 15.0))
         speed = 30.0 * t * t * (1.0 - t) ** 2 / self._duration_s
-        change = 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t) / self._duration_s**2
+        soon = max(0.0, min((time_s + PREVIEW_S) / self._duration_s, 1.0))
+        change = 60.0 * soon * (1.0 - soon) * (1.0 - 2.0 * soon) / self._duration_s**2
         x, y, z = self._start
         dx, dy, dz = self._way
         return Reference(
@@ -129,6 +134,12 @@ class Follower:
         self._since_s += dt_s
         return self._leg.at(self._since_s)
 
+    @staticmethod
+    def error_m(reference: Reference, position_m: Vector) -> float:
+        """Return the distance of a position from the reference, above the ground [m]."""
+        x, y, z = reference.position_m
+        return math.dist((x, y, max(z, REST_HEIGHT_M)), position_m)
+
     def arrived(self, error_m: float, climb_mps: float, dt_s: float) -> bool:
         """Return whether the leg is over.
 
@@ -138,7 +149,9 @@ class Follower:
             dt_s: time since the previous call [s].
         """
         waypoint = self.waypoint
-        if waypoint is None or self._since_s < waypoint.duration_s:
+        if waypoint is None:
+            return True
+        if self._since_s < waypoint.duration_s:
             return False
         # Who aims below the ground has landed when he sinks no further.
         there = abs(climb_mps) < RESTING_MPS if waypoint.landing else error_m < ARRIVED_M

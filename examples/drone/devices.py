@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import horus
 from drone import sensors
 from drone.estimation import AttitudeFilter
 from drone.flight_log import DISCONNECTED, FlightLog
-from drone.messages import NEWEST_NAV, Imu, Navigation
 from drone.geometry import NOTHING, moved, roll_pitch_yaw
-from drone.world import MAX_ADVANCE_S
+from drone.messages import NEWEST_NAV, Imu, Navigation
 from horus import Node
 
 if TYPE_CHECKING:
@@ -39,17 +37,19 @@ class ImuNode(Node):
         if self._device is None:
             return
         fusion, raw = self._filter, self._device.read(self._world.snapshot)
+        # Integrated is over the device's own clock: a thread that is late, or early again, would
+        # otherwise turn its jitter into attitude.
+        dt_s, self._time_s = raw.time_s - self._time_s, raw.time_s
+        if dt_s <= 0.0:
+            return
         nav: Navigation | None = self.latest("nav")
-        # The hardware stands still during a long pause, and so must whoever integrates it.
-        dt_s = min(horus.dt(), MAX_ADVANCE_S)
         rates = fusion.update(raw, dt_s, NOTHING if nav is None else nav.drift_mps2)
         if fusion.calibrated:
             self._gained = moved(self._gained, dt_s, fusion.acceleration_mps2(raw))
-            self._time_s += dt_s
         self.send(
             "imu",
             Imu(
-                time_s=self._time_s,
+                time_s=raw.time_s,
                 angles_rad=roll_pitch_yaw(fusion.attitude),
                 rates_radps=rates,
                 gained_mps=self._gained,

@@ -57,9 +57,9 @@ class FlightLog:
         """Note that something happened, now."""
         self.events.append(Event(at_s=self.clock(), node=node, what=what, detail=detail))
 
-    def add_reference(self, leg: str, position_m: Vector) -> None:
-        """Note where the drone should be, now."""
-        self.references.append((self.clock(), leg, position_m))
+    def add_reference(self, at_s: float, leg: str, position_m: Vector) -> None:
+        """Note where the drone should be at a time of the sensors' clock [s]."""
+        self.references.append((at_s, leg, position_m))
 
     def find(self, what: str) -> list[Event]:
         """Return the events of one kind, in the order they happened."""
@@ -113,6 +113,11 @@ class Outcome:
         return corners and all(side in self.legs_flown for side in SIDES)
 
     @property
+    def legs(self) -> str:
+        """Return what was flown, in words."""
+        return ", ".join(self.legs_flown) or "nothing"
+
+    @property
     def motors_off_first(self) -> bool:
         """Return whether the motors were off before any sensor disconnected."""
         order = self.shutdown_order
@@ -123,13 +128,17 @@ class Outcome:
     @property
     def failures(self) -> list[str]:
         """Return the promises that were broken, in words."""
+        # What was never measured, because the drone never flew, is nan and exceeds nothing.
         promises = (
-            (self.square_flown, f"the square was not flown, only {list(self.legs_flown)}"),
-            (self.rms_m < TRACKING_RMS_M, f"tracking error RMS {self.rms_m:.3f} m"),
-            (self.max_m < TRACKING_MAX_M, f"tracking error up to {self.max_m:.3f} m"),
+            (self.square_flown, f"the square was not flown, only: {self.legs}"),
+            (not self.rms_m >= TRACKING_RMS_M, f"tracking error RMS {self.rms_m:.3f} m"),
+            (not self.max_m >= TRACKING_MAX_M, f"tracking error up to {self.max_m:.3f} m"),
             (self.landed, "the drone does not stand on its legs"),
             (self.landing_error_m < LANDING_M, f"landed {self.landing_error_m:.2f} m off"),
-            (self.touchdown_mps < TOUCHDOWN_MPS, f"touched down at {self.touchdown_mps:.2f} m/s"),
+            (
+                not self.touchdown_mps >= TOUCHDOWN_MPS,
+                f"touched down at {self.touchdown_mps:.2f} m/s",
+            ),
             (not self.failsafe, "the ESC had to take over"),
             (self.thrust_at_end_n < 0.01, "the rotors still pushed at the end"),
             (self.motors_off_first, f"sensors before motors: {self.shutdown_order}"),
@@ -151,9 +160,9 @@ def judge(log: FlightLog, record: Record) -> Outcome:
         ),
         tracking=tracking,
         rms_m=_rms(tracking.error_m),
-        max_m=float(tracking.error_m.max(initial=0.0)),
+        max_m=_max(tracking.error_m),
         square_rms_m=_rms(square),
-        square_max_m=float(square.max(initial=0.0)),
+        square_max_m=_max(square),
         max_tilt_rad=float(track[:, 5].max()),
         landed=bool(abs(end[3] - REST_HEIGHT_M) < 0.02 and end[4] < 0.05 and end[5] < 0.05),
         landing_error_m=math.dist(end[1:3], START_M[:2]),
@@ -166,8 +175,12 @@ def judge(log: FlightLog, record: Record) -> Outcome:
 
 
 def _tracking(log: FlightLog, track: np.ndarray) -> Tracking:
-    time_s = np.array([at_s for at_s, _, _ in log.references])
-    commanded = np.array([where for _, _, where in log.references]).reshape(-1, 3)
+    # Once the ESC brings the drone down, nobody follows the reference any more.
+    taken_over = [event.at_s for event in log.find(FAILSAFE)]
+    end_s = min(taken_over, default=math.inf)
+    references = [entry for entry in log.references if entry[0] <= end_s]
+    time_s = np.array([at_s for at_s, _, _ in references])
+    commanded = np.array([where for _, _, where in references]).reshape(-1, 3)
     # The landing aims below the ground; to stand on it is what was asked for.
     commanded[:, 2] = np.maximum(commanded[:, 2], REST_HEIGHT_M)
     flown = np.column_stack([np.interp(time_s, track[:, 0], track[:, k]) for k in (1, 2, 3)])
@@ -175,12 +188,16 @@ def _tracking(log: FlightLog, track: np.ndarray) -> Tracking:
         time_s=time_s,
         commanded_m=commanded,
         error_m=np.linalg.norm(flown - commanded, axis=1),
-        leg=np.array([leg for _, leg, _ in log.references], dtype=str),
+        leg=np.array([leg for _, leg, _ in references], dtype=str),
     )
 
 
 def _rms(errors_m: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else math.nan
+
+
+def _max(errors_m: np.ndarray) -> float:
+    return float(errors_m.max()) if len(errors_m) else math.nan
 
 
 def _touchdown_mps(track: np.ndarray) -> float:
@@ -191,23 +208,30 @@ def _touchdown_mps(track: np.ndarray) -> float:
     return float(track[high[-1], 4])
 
 
+def _in(unit: str, value: float) -> str:
+    return f"{value:.3f} {unit}" if math.isfinite(value) else "none"
+
+
 def report(log: FlightLog, outcome: Outcome) -> str:
     """Return the flight in words, for the terminal."""
-    corners = ", ".join(f"{miss_m:.3f}" for miss_m in outcome.corner_misses_m)
     lines = ["Flight log"]
     lines += [
         f"  {event.at_s:7.3f} s  {event.node:<9} {event.what}"
         + (f": {event.detail}" if event.detail else "")
         for event in log.events
     ]
+    corners = ", ".join(f"{miss_m:.3f}" for miss_m in outcome.corner_misses_m)
+    rms, most = _in("m", outcome.rms_m), _in("m", outcome.max_m)
+    square_rms, square_most = _in("m", outcome.square_rms_m), _in("m", outcome.square_max_m)
     lines += [
         "",
         f"square flown          {outcome.square_flown} (corners missed by {corners} m)",
-        f"tracking error        RMS {outcome.rms_m:.3f} m, max {outcome.max_m:.3f} m",
-        f"  on the square       RMS {outcome.square_rms_m:.3f} m, max {outcome.square_max_m:.3f} m",
+        f"tracking error        RMS {rms}, max {most}",
+        f"on the square         RMS {square_rms}, max {square_most}",
         f"greatest tilt         {math.degrees(outcome.max_tilt_rad):.1f} degrees",
-        f"landed                {outcome.landed} (off by {outcome.landing_error_m:.3f} m, "
-        f"touched down at {outcome.touchdown_mps:.2f} m/s)",
+        f"landed                {outcome.landed} (off by {outcome.landing_error_m:.3f} m)",
+        f"touchdown             {_in('m/s', outcome.touchdown_mps)}",
+        f"thrust at the end     {outcome.thrust_at_end_n:.3f} N",
         f"shutdown order        {' -> '.join(outcome.shutdown_order)}",
         f"trajectory sha256     {outcome.trajectory_sha256}",
     ]

@@ -24,7 +24,7 @@ class Imu:
     """What the IMU and its filter know."""
 
     time_s: float
-    """How long the filter has been integrating [s]."""
+    """When it was measured, by the device's own clock."""
     angles_rad: Vector
     """Roll, pitch and yaw."""
     rates_radps: Vector

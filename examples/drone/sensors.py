@@ -27,6 +27,8 @@ GPS_VELOCITY_NOISE_MPS = 0.04
 class RawImu:
     """What the IMU says: the truth, its biases and noise."""
 
+    time_s: float
+    """When it was measured, by the device's own clock."""
     rates_radps: Vector
     specific_force_mps2: Vector
     heading_rad: float
@@ -62,6 +64,7 @@ class Imu:
         p, q, r = state.rates_radps
         x, y, z = state.specific_force_mps2
         return RawImu(
+            time_s=state.time_s,
             rates_radps=(p + off[0], q + off[1], r + off[2]),
             specific_force_mps2=(x + off[3], y + off[4], z + off[5]),
             heading_rad=roll_pitch_yaw(state.attitude)[2] + off[6],

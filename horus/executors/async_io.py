@@ -104,10 +104,10 @@ class AsyncIoExecutor(LoopExecutor):
         """Build the node's tick path."""
         self._tasks.adopt(live)
 
-    def engage(self, live: LiveNode) -> None:
+    def engage(self, live: LiveNode, from_ns: int) -> None:
         """Release the node on its grid."""
         live.enter_service()
-        self._cycle.add(live, self._release)
+        self._cycle.add(live, self._release, from_ns)
 
     def disengage(self, live: LiveNode) -> None:
         """Release the node no more and cancel its tick in progress: sleeps end at shutdown."""

@@ -23,10 +23,10 @@ class BestEffortExecutor(LoopExecutor):
         """Build the node's tick path."""
         self._ticks[live] = build_tick(live)
 
-    def engage(self, live: LiveNode) -> None:
+    def engage(self, live: LiveNode, from_ns: int) -> None:
         """Release the node on its grid."""
         live.enter_service()
-        self._cycle.add(live, self._tick)
+        self._cycle.add(live, self._tick, from_ns)
 
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
         """Run a callback on the loop's thread."""

@@ -43,10 +43,10 @@ class ComputeExecutor(ThreadExecutor[ComputeThread]):
         """Return the node's thread, not started."""
         return ComputeThread(live)
 
-    def engage(self, live: LiveNode) -> None:
+    def engage(self, live: LiveNode, from_ns: int) -> None:
         """Release the node on its grid."""
         live.enter_service()
-        self._cycle.add(live, self._release)
+        self._cycle.add(live, self._release, from_ns)
 
     def disengage(self, live: LiveNode) -> None:
         """Release the node no more."""

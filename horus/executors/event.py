@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from concurrent.futures import Future
 
 from horus.executors.async_io import TaskRunner
 from horus.executors.base import LoopExecutor
-from horus.live import LiveNode
+from horus.live import EventTick, LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
 from horus.tick_path import RunTick, build_tick
@@ -30,7 +31,7 @@ class EventExecutor(LoopExecutor):
         else:
             self._runners[live] = _EventRunner(live, self._bridge, build_tick(live), self._tasks)
 
-    def engage(self, live: LiveNode) -> None:
+    def engage(self, live: LiveNode, from_ns: int) -> None:
         """Listen to the trigger topic, starting with what has arrived already."""
         live.enter_service()
         self._runners[live].listen()
@@ -70,8 +71,10 @@ class _EventRunner:
         self._run_tick = run_tick
         self._tasks = tasks
         self._scheduled = False
-        self._woken_ns = 0
         self._now_ns = live.timeline.now_ns
+        # When each waiting message arrived: its tick's release. In step with the
+        # queue, and as bounded.
+        self._arrivals: deque[int] = deque(maxlen=trigger.capacity)
 
     def listen(self) -> None:
         self._trigger.wake = self.wake
@@ -82,10 +85,13 @@ class _EventRunner:
         self._trigger.wake = None
 
     def wake(self) -> None:
-        """Schedule a tick, unless one is scheduled already. Thread: any."""
+        """Take note of a message. Thread: any."""
+        self._arrivals.append(self._now_ns())
+        self._schedule()
+
+    def _schedule(self) -> None:
         if not self._scheduled:
             self._scheduled = True
-            self._woken_ns = self._now_ns()
             if self._bridge.on_loop_thread():
                 self._bridge.loop.call_soon(self._step)
             else:
@@ -103,15 +109,18 @@ class _EventRunner:
             self._scheduled = True
             self._bridge.loop.call_later(to_s(delay_ns), self._step)
             return
-        received = self._trigger.received
+        release_ns = self._arrivals[0] if self._arrivals else self._now_ns()
+        before = EventTick(live)
         if self._run_tick is None:
-            task = self._tasks.start(live, self._woken_ns)
-            task.add_done_callback(lambda _: self._ticked(received))
+            task = self._tasks.start(live, release_ns)
+            task.add_done_callback(lambda _: self._ticked(before))
         else:
-            self._run_tick(self._woken_ns)
-            self._ticked(received)
+            self._run_tick(release_ns)
+            self._ticked(before)
 
-    def _ticked(self, received: int) -> None:
-        self._trigger.consume_one_since(received)
+    def _ticked(self, before: EventTick) -> None:
+        before.settle()
+        while len(self._arrivals) > len(self._trigger.queue):
+            self._arrivals.popleft()
         if self._trigger.queue and not self._live.retired:
-            self.wake()
+            self._schedule()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
 from horus.tick_path import build_tick
@@ -48,18 +50,19 @@ class RtThread(NodeThread):
         self._index += 1
         self._release_ns = self._grid.at(self._index)
 
-    def engage(self) -> None:
-        """Begin with the first release that is still to come."""
-        self._join_grid()
+    def engage(self, from_ns: int) -> None:
+        """Begin with the first release at or after `from_ns` [ns]."""
+        self._join_grid(from_ns)
         self.engaged = True
 
     def retime(self) -> None:
         """Move to the grid of the node's new rate."""
-        self._join_grid()
+        last_ns = self.live.tick_context.release_ns
+        self._join_grid(max(self._now_ns(), last_ns + 1))
 
-    def _join_grid(self) -> None:
+    def _join_grid(self, from_ns: int) -> None:
         self._grid = self.live.grid()
-        self._index = self._grid.first_from(self._now_ns())
+        self._index = self._grid.first_from(from_ns)
         self._release_ns = self._grid.at(self._index)
 
 
@@ -70,11 +73,11 @@ class RtExecutor(ThreadExecutor[RtThread]):
         """Return the node's thread, not started."""
         return RtThread(live)
 
-    def engage(self, live: LiveNode) -> None:
+    def engage(self, live: LiveNode, from_ns: int) -> None:
         """Let the thread release the node."""
         live.enter_service()
         thread = self.thread_of(live)
-        thread.post(thread.engage)
+        thread.post(functools.partial(thread.engage, from_ns))
 
     def disengage(self, live: LiveNode) -> None:
         """Let the thread begin no further tick."""

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import threading
 from collections import deque
 from collections.abc import Callable
+
+_log = logging.getLogger("horus.scheduler")
 
 
 class Bridge:
@@ -86,7 +89,11 @@ class Bridge:
         self._awake = False
         # Bounded by what waits now, so that a flood leaves the loop its turn.
         for _ in range(len(self._calls)):
-            self._calls.popleft()()
+            try:
+                self._calls.popleft()()
+            except Exception:
+                # The others behind it may be an emergency stop.
+                _log.exception("a call into the event loop failed")
         if self._calls and not self._awake and not self._closed:
             self._awake = True
             self._wake()

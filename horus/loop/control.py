@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
 
 from horus.errors import NodeError
@@ -18,23 +19,24 @@ class RunControl:
     Thread: any.
     """
 
-    def __init__(self, max_deadline_misses: int | None, total_misses: Callable[[], int]) -> None:
-        """Watch over a scheduler; `total_misses` counts over all its nodes."""
+    def __init__(self, max_deadline_misses: int | None) -> None:
+        """Watch over the runs of a scheduler."""
         self._max_deadline_misses = max_deadline_misses
-        self._total_misses = total_misses
-        self._warned = False
+        self._lock = threading.Lock()
+        self._misses = 0
         self._on_stop: Callable[[], None] | None = None
         self.stop_reason: str | None = None
         self.failure: NodeError | None = None
 
     def begin(self, on_stop: Callable[[], None]) -> None:
         """Start a run that `on_stop` ends."""
+        self._misses = 0
         self.stop_reason = None
         self.failure = None
         self._on_stop = on_stop
 
     def end(self) -> None:
-        """Take note that the run is over."""
+        """Take note that ticking is over: a reason to stop comes too late."""
         self._on_stop = None
 
     @property
@@ -44,10 +46,11 @@ class RunControl:
 
     def request_stop(self, reason: str) -> None:
         """Stop in order; the first reason given is the one reported."""
-        if self.stop_reason is None:
-            self.stop_reason = reason
-        if self._on_stop is not None:
-            self._on_stop()
+        on_stop = self._on_stop
+        if on_stop is not None:
+            if self.stop_reason is None:
+                self.stop_reason = reason
+            on_stop()
 
     def fail(self, error: NodeError) -> None:
         """Stop in order; `run()` then raises `error`."""
@@ -57,16 +60,17 @@ class RunControl:
 
     def count_miss(self) -> None:
         """Stop when the limit on missed deadlines is reached."""
-        total = self._total_misses()
+        with self._lock:
+            self._misses += 1
+            misses = self._misses
         if self._max_deadline_misses is None:
-            if total >= _WARN_AT_MISSES and not self._warned:
-                self._warned = True
+            if misses == _WARN_AT_MISSES:
                 _log.warning(
-                    "%d deadlines were missed so far; no max_deadline_misses is set, so the "
-                    "run goes on",
-                    total,
+                    "%d deadlines were missed in this run; no max_deadline_misses is set, so it "
+                    "goes on",
+                    misses,
                 )
-        elif total >= self._max_deadline_misses:
+        elif misses >= self._max_deadline_misses:
             self.request_stop(
-                f"{total} deadlines were missed, max_deadline_misses={self._max_deadline_misses}"
+                f"{misses} deadlines were missed, max_deadline_misses={self._max_deadline_misses}"
             )

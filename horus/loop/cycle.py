@@ -47,10 +47,10 @@ class Cycle:
             self._dispatch[live](live, release_ns)
         self._arm()
 
-    def add(self, live: LiveNode, dispatch: Dispatch) -> None:
-        """Release `live` on its grid from now on."""
+    def add(self, live: LiveNode, dispatch: Dispatch, from_ns: int) -> None:
+        """Release `live` on its grid, with the first release at or after `from_ns` [ns]."""
         self._dispatch[live] = dispatch
-        self._releases.add(live, live.rank, self._now_ns())
+        self._releases.add(live, live.rank, from_ns)
         self._arm()
 
     def remove(self, live: LiveNode) -> None:

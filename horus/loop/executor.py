@@ -23,8 +23,8 @@ class Executor(Protocol):
         Thread: loop.
         """
 
-    def engage(self, live: LiveNode) -> None:
-        """Let ticks begin.
+    def engage(self, live: LiveNode, from_ns: int) -> None:
+        """Let ticks begin, with the first release at or after `from_ns` [ns].
 
         Thread: loop.
         """

@@ -8,11 +8,13 @@ import contextvars
 import logging
 import selectors
 import threading
+import weakref
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from horus.clock import SimClock
+from horus.errors import HorusError
 from horus.units import to_ns, to_s
 
 T = TypeVar("T")
@@ -22,7 +24,7 @@ _log = logging.getLogger("horus.scheduler")
 _LAST_STEPS_S = 1.0
 """How long cancelled tasks may take to end when a loop is closed [s]."""
 
-_IO_PATIENCE_S = 0.02
+_IO_PATIENCE_S = 5.0
 """How long virtual time stands still for sockets to answer, in real time [s]."""
 
 
@@ -95,13 +97,23 @@ class StepLoop:
         self.loop.close()
 
 
+class StuckError(HorusError):
+    """A callback waits in virtual time for something that will never come."""
+
+    def __init__(self) -> None:
+        """Say what cannot happen."""
+        super().__init__(
+            "it waits, and nothing in virtual time will wake it: no timer, no message, no socket"
+        )
+
+
 class VirtualLoop(StepLoop):
     """An event loop on simulated time: `asyncio.sleep(60)` ends when the clock says so.
 
     Timers follow the simulation's clock. Work handed to threads runs at once,
-    inline. Sockets are real: while a tick waits for one, virtual time stands
-    still for a moment, so that a server on this machine answers within the
-    instant of the question.
+    inline. Sockets are real: while a task waits for one, virtual time stands
+    still, so that a server on this machine answers within the instant of the
+    question.
     """
 
     def __init__(self, clock: SimClock) -> None:
@@ -110,7 +122,7 @@ class VirtualLoop(StepLoop):
         self._next_timer_ns: int | None = None
         self._selector = _IdleSelector()
         super().__init__(_SimulatedLoop(clock, self._selector))
-        self._selector.when_idle = self.loop.stop
+        self._selector.attach(self.loop)
 
     @property
     def next_timer_ns(self) -> int | None:
@@ -131,14 +143,19 @@ class VirtualLoop(StepLoop):
         self.loop.run_forever()
 
     def run(self, work: Coroutine[Any, Any, T], context: contextvars.Context | None = None) -> T:
-        """Run a coroutine to its end, moving the clock from timer to timer."""
+        """Run a coroutine to its end, moving the clock from timer to timer.
+
+        Raises:
+            StuckError: It waits for what will never come.
+        """
         task = self.loop.create_task(work, context=context)
         self.settle()
         while not task.done():
             if self._next_timer_ns is None:
                 task.cancel()
-            else:
-                self._clock.advance_to(self._next_timer_ns)
+                self.settle()
+                raise StuckError
+            self._clock.advance_to(self._next_timer_ns)
             self.settle()
         return task.result()
 
@@ -170,28 +187,49 @@ class _IdleSelector(selectors.DefaultSelector):
 
     def __init__(self) -> None:
         super().__init__()
-        self.when_idle: Callable[[], None] = lambda: None
+        self._loop: asyncio.AbstractEventLoop | None = None
         self.idle_s: float | None = None
         """How long the loop would have slept [s]; None for ever."""
-        self._has_progressed = False
+        # What turned out not to be about a socket, or never to be answered.
+        self._given_up: weakref.WeakSet[Any] = weakref.WeakSet()
+
+    def attach(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Stop `loop` when it is idle."""
+        self._loop = loop
 
     def select(self, timeout: float | None = None) -> list[Any]:
         events = super().select(0)
-        if events or timeout == 0:
-            self._has_progressed = True
+        if events or timeout == 0 or self._loop is None:
             return events
-        if self._has_progressed and self._watches_sockets():
-            # Once per standstill: a connection that is merely kept open must not
-            # cost every simulated millisecond a real wait.
-            self._has_progressed = False
+        # More than the loop's own wake-up pipe: somebody has a socket open.
+        if len(self.get_map()) > 1 and (waits := self._waits_for_sockets(self._loop)):
             events = super().select(_IO_PATIENCE_S)
             if events:
-                self._has_progressed = True
                 return events
+            self._given_up.update(waits)
         self.idle_s = timeout
-        self.when_idle()
+        self._loop.stop()
         return []
 
-    def _watches_sockets(self) -> bool:
-        """Return whether anything but the loop's own wake-up pipe is registered."""
-        return len(self.get_map()) > 1
+    def _waits_for_sockets(self, loop: asyncio.AbstractEventLoop) -> list[asyncio.Future[Any]]:
+        """Return what tasks wait for that may be a socket: neither a sleep nor another task."""
+        waits = []
+        for task in asyncio.all_tasks(loop):
+            future = getattr(task, "_fut_waiter", None)
+            if future is None or isinstance(future, asyncio.Task) or _sleeps(task.get_coro()):
+                continue
+            if future not in self._given_up:
+                waits.append(future)
+        return waits
+
+
+def _sleeps(coroutine: Any) -> bool:
+    """Return whether a coroutine is, at the bottom of its calls, in `asyncio.sleep`."""
+    while coroutine is not None:
+        if getattr(coroutine, "cr_code", None) is _SLEEP:
+            return True
+        coroutine = getattr(coroutine, "cr_await", None)
+    return False
+
+
+_SLEEP = asyncio.sleep.__code__

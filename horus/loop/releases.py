@@ -45,11 +45,11 @@ class ReleaseQueue:
             heapq.heappop(self._heap)
         return self._heap[0].at_ns if self._heap else None
 
-    def add(self, live: LiveNode, rank: Rank, now_ns: int, last_ns: int = clock.NEVER) -> None:
-        """Queue the first release of `live` at or after `now_ns`, and after `last_ns`."""
+    def add(self, live: LiveNode, rank: Rank, from_ns: int, last_ns: int = clock.NEVER) -> None:
+        """Queue the first release of `live` at or after `from_ns`, and after `last_ns` [ns]."""
         self.remove(live)
         grid = live.grid()
-        index = grid.first_from(max(now_ns, last_ns + 1))
+        index = grid.first_from(max(from_ns, last_ns + 1))
         release = _Release(grid.at(index), rank, index, grid, live, last_ns)
         self._of_node[live] = release
         heapq.heappush(self._heap, release)

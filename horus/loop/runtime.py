@@ -31,7 +31,10 @@ Members = Callable[[], Iterable[LiveNode]]
 
 
 class Runtime:
-    """Owns what exists only while a scheduler runs: loop hooks, homes, supervisor.
+    """Owns what real-time runs need: loop hooks, homes, supervisor.
+
+    `play` runs the nodes for a while, again and again if need be; their homes,
+    and what `init()` opened in them, stay until `close`.
 
     Thread: loop, except the methods that say otherwise. Those only leave a note
     (`_post`) for the loop, which alone decides who takes part.
@@ -44,16 +47,19 @@ class Runtime:
         make_executors: MakeExecutors,
         shutdown_timeout_ns: int,
     ) -> None:
-        """Describe a run; nothing happens before `run`."""
+        """Describe a run; nothing happens before `play`."""
         self._name = name
         self._timeline = timeline
         self._make_executors = make_executors
         self._shutdown_timeout_ns = shutdown_timeout_ns
+        self._resources = contextlib.ExitStack()
         self._homes: dict[LiveNode, Executor] = {}
+        self._stuck: set[LiveNode] = set()
         self._joining: deque[LiveNode] = deque()
-        self._grid_started = False
+        self._playing = False
+        self._closing = False
         self._stop_requested = threading.Event()
-        self._stopping = threading.Event()
+        self._reacted = threading.Event()
         self._stop_event = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
         self._lock = threading.Lock()
@@ -61,28 +67,37 @@ class Runtime:
         self._over = False
         self._notes: deque[Callable[[], None]] = deque()
 
-    async def run(
-        self, members: Members, duration_ns: int | None, *, shut_down_after: bool = True
-    ) -> None:
-        """Initialise the nodes, tick them until stopped, and bring them to rest.
+    async def play(self, members: Members, duration_ns: int | None) -> None:
+        """Initialise the nodes that are new, and tick until stopped or for a time.
 
         Args:
-            members: Tells the nodes to begin with.
+            members: Tells the nodes that take part.
             duration_ns: How long to tick [ns]; None until stopped.
-            shut_down_after: Whether `shutdown()` is called at the end. A timed step
-                of a simulation leaves its nodes initialised for the next one.
         """
-        with contextlib.ExitStack() as resources:
-            self._open(resources)
-            try:
-                await self._initialize(members())
-                self._engage(duration_ns)
-                await self._until_stopped()
-            finally:
-                self._stop_requested.set()
-                self._stopping.set()
-                self._timeline.pause()
-                await uninterrupted(self._finish(shut_down_after))
+        if self._bridge is None:
+            self._open()
+        try:
+            await self._initialize(members())
+            self._engage(set(members()), duration_ns)
+            await self._until_stopped()
+        finally:
+            self._playing = False
+            self._reacted.set()
+            self._timeline.pause()
+            await uninterrupted(self._pause)
+
+    async def close(self) -> None:
+        """Bring every node to rest in order, and give everything back."""
+        self._closing = True
+        try:
+            await uninterrupted(self._shut_down)
+        finally:
+            for live, home in self._homes.items():
+                home.dismiss(live)
+            self._homes.clear()
+            with self._lock:
+                self._bridge, self._over = None, True
+            self._resources.close()
 
     # -- from anywhere ------------------------------------------------------------
 
@@ -102,10 +117,19 @@ class Runtime:
         bridge = self._bridge
         if bridge is not None and not bridge.on_loop_thread():
             self._supervisor.spawn(
-                report_blocked_loop(
-                    bridge.thread_id, self._stopping, to_s(self._shutdown_timeout_ns)
+                lambda: report_blocked_loop(
+                    bridge.thread_id, self._reacted, to_s(self._shutdown_timeout_ns)
                 )
             )
+
+    def rearm(self) -> None:
+        """Forget an earlier stop: another `play` is about to begin.
+
+        Thread: any, while nothing runs.
+        """
+        self._stop_requested.clear()
+        self._reacted.clear()
+        self._stop_event.clear()
 
     def add(self, live: LiveNode) -> None:
         """Initialise a node and let it tick, as soon as the loop is free.
@@ -168,32 +192,26 @@ class Runtime:
 
     # -- the run ------------------------------------------------------------------
 
-    def _open(self, resources: contextlib.ExitStack) -> None:
-        """Acquire what the run needs; the stack gives it back in reverse."""
+    def _open(self) -> None:
+        """Acquire what runs need; the stack gives it back in reverse."""
         # anyio loads its backend on first use, which takes tens of milliseconds:
         # now, not after the first release.
         anyio.current_effective_deadline()
         self._supervisor = Supervisor(self._name)
         self._supervisor.start()
-        resources.callback(self._supervisor.close)
+        self._resources.callback(self._supervisor.close)
         bridge = Bridge(asyncio.get_running_loop())
-        resources.callback(bridge.close)
+        self._resources.callback(bridge.close)
         cycle = Cycle(bridge.loop, self._timeline)
-        resources.callback(cycle.close)
+        self._resources.callback(cycle.close)
         self._executors = self._make_executors(bridge, cycle)
-        resources.callback(self._close)
         with self._lock:
             self._bridge = bridge
         while self._notes:
             self._notes.popleft()()
 
-    def _close(self) -> None:
-        with self._lock:
-            self._bridge = None
-            self._over = True
-
     async def _initialize(self, lives: Iterable[LiveNode]) -> None:
-        """Call `init()` of each node in order; one that fails is left out, others go on."""
+        """Call `init()` of each new node in order; one that fails is left out, others go on."""
         self._joining.extend(sorted(lives, key=lambda live: live.rank))
         while self._joining and not self._stop_requested.is_set():
             # Nodes that are added by an init() come after those that were there.
@@ -205,24 +223,28 @@ class Runtime:
         home = self._executors[live.spec.execution_class]
         self._homes[live] = home
         home.adopt(live)
-        if live.state is NodeState.UNINITIALIZED:
-            initialized = asyncio.wrap_future(home.call(live, "init"))
-            # A stop ends the wait for an init() that hangs on another thread.
-            stopped = asyncio.ensure_future(self._stop_event.wait())
+        if live.state is not NodeState.UNINITIALIZED:
+            return
+        initialized = asyncio.wrap_future(home.call(live, "init"))
+        # A stop ends the wait for an init() that hangs on another thread.
+        stopped = asyncio.ensure_future(self._stop_event.wait())
+        try:
             await asyncio.wait((initialized, stopped), return_when=asyncio.FIRST_COMPLETED)
+        finally:
             stopped.cancel()
 
-    def _engage(self, duration_ns: int | None) -> None:
+    def _engage(self, members: set[LiveNode], duration_ns: int | None) -> None:
         """Start the release grid, and with it the ticks."""
         self._timeline.begin(self._timeline.now_ns() + _HEAD_START_NS, duration_ns)
         clock.set_ambient(self._timeline)
-        self._grid_started = True
+        self._playing = True
         for live in self._homes:
-            self._engage_one(live)
+            if live in members:
+                self._engage_one(live, self._timeline.epoch_ns)
 
-    def _engage_one(self, live: LiveNode) -> None:
+    def _engage_one(self, live: LiveNode, from_ns: int) -> None:
         if live.initialized and not live.removed and not self._stop_requested.is_set():
-            self._homes[live].engage(live)
+            self._homes[live].engage(live, from_ns)
 
     async def _until_stopped(self) -> None:
         timeline = self._timeline
@@ -236,66 +258,81 @@ class Runtime:
                 return
 
     def _join(self, live: LiveNode) -> None:
-        """Let a node that was added during the run take part."""
-        if not self._grid_started:
+        """Let a node that was added take part: in this run, or in the next."""
+        if not self._playing:
             self._joining.append(live)
         elif not self._stop_requested.is_set():
-            task = asyncio.ensure_future(self._bring_up(live))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            self._spawn(self._bring_up(live))
 
     async def _bring_up(self, live: LiveNode) -> None:
         await self._adopt(live)
-        if live in self._homes:
-            self._engage_one(live)
+        if live in self._homes and self._playing:
+            self._engage_one(live, self._timeline.now_ns())
 
     def _leave(self, live: LiveNode, removed: Future[None]) -> None:
-        """Take a node out of the run: when its home is free, shut it down and dismiss it."""
+        """Take a node out of the run, when its home is free."""
         home = self._homes.get(live)
-        if home is None or self._stopping.is_set():
+        if home is None or self._closing:
             removed.set_result(None)
             return
         home.disengage(live)
 
-        def dismiss() -> None:
+        def finish(_: object) -> None:
             live.stopped()
-            if self._homes.pop(live, None) is not None:
-                home.dismiss(live)
-            removed.set_result(None)
+            if not removed.done():
+                removed.set_result(None)
+            self._post(lambda: self._dismiss(live))
 
-        def shut_down() -> None:
-            if live.initialized:
-                shutdown = begin_shutdown(live, home)
-                shutdown.add_done_callback(lambda _: self._post(dismiss))
-            else:
-                dismiss()
+        def shut_down(_: object) -> None:
+            shutdown = begin_shutdown(live, home)
+            shutdown.add_done_callback(finish)
+
+        def leave_behind() -> None:
+            if not free.done():
+                begin_shutdown(live, None).add_done_callback(finish)
 
         # Whatever runs in the home comes first, also an init() that has just begun.
-        home.call(live, None).add_done_callback(lambda _: self._post(shut_down))
+        # The rest happens in the home, not here: a tick that removes another node
+        # may be what keeps this loop busy.
+        free = home.call(live, None)
+        free.add_done_callback(shut_down)
+        asyncio.get_running_loop().call_later(to_s(self._shutdown_timeout_ns), leave_behind)
 
-    async def _finish(self, shut_down_after: bool) -> None:
-        if shut_down_after:
-            await shut_down(self._homes, self._shutdown_timeout_ns)
-            return
-        await quiesce(self._homes, self._shutdown_timeout_ns)
-        for live, home in self._homes.items():
+    def _dismiss(self, live: LiveNode) -> None:
+        home = self._homes.pop(live, None)
+        if home is not None:
             home.dismiss(live)
 
+    async def _pause(self) -> None:
+        self._stuck = await quiesce(self._homes, self._shutdown_timeout_ns)
 
-async def uninterrupted(work: Coroutine[Any, Any, None]) -> None:
+    async def _shut_down(self) -> None:
+        await shut_down(self._homes, self._stuck, self._shutdown_timeout_ns)
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+
+async def uninterrupted(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
     """Run `work` to its end whatever cancels the caller, then be cancelled after all.
 
     anyio's shield keeps away the cancellation of task groups and time limits,
-    asyncio's shield a `task.cancel()`; an application may use either.
+    asyncio's shield a `task.cancel()`; an application may use either. One that
+    cancels all tasks it can find hits the work itself, which then starts anew.
     """
-    task = asyncio.ensure_future(work)
     cancelled: asyncio.CancelledError | None = None
     with anyio.CancelScope(shield=True):
-        while not task.done():
-            try:
-                await asyncio.shield(task)
-            except asyncio.CancelledError as exc:
-                cancelled = exc
+        while True:
+            task = asyncio.ensure_future(work())
+            while not task.done():
+                try:
+                    await asyncio.shield(task)
+                except asyncio.CancelledError as exc:
+                    cancelled = exc
+            if not task.cancelled():
+                break
     task.result()
     if cancelled is not None:
         raise cancelled

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable
 from horus.clock import SimClock, Timeline
 from horus.errors import StateError
 from horus.graph import contradictions, dataflow_order
-from horus.live import LiveNode
+from horus.live import EventTick, LiveNode
 from horus.loop.private_loop import VirtualLoop
 from horus.loop.releases import ReleaseQueue
 from horus.loop.stepping import Stepper
@@ -40,26 +40,27 @@ class Simulation(Stepper):
     Thread: one at a time.
     """
 
-    def __init__(self, timeline: Timeline, sim_clock: SimClock) -> None:
+    def __init__(
+        self, timeline: Timeline, sim_clock: SimClock, stopped: Callable[[], bool]
+    ) -> None:
         """Begin at the clock's instant, with no nodes."""
-        super().__init__(timeline)
+        super().__init__(timeline, self._virtual_loop, stopped)
         self._clock = sim_clock
+        self._begun = False
         self._releases = ReleaseQueue()
         self._messaged: dict[LiveNode, None] = {}
         self._in_flight: dict[LiveNode, asyncio.Task[None]] = {}
         self._places: dict[LiveNode, tuple[int, int]] = {}
         self._virtual: VirtualLoop | None = None
 
-    def make_loop(self) -> VirtualLoop:
-        """Return a loop on simulated time."""
-        self._virtual = VirtualLoop(self._clock)
-        return self._virtual
-
     # -- membership ---------------------------------------------------------------
 
-    def start(self, lives: Iterable[LiveNode]) -> None:
-        """Initialise the nodes and begin the release grid."""
-        super().start(lives)
+    def take_on(self, lives: tuple[LiveNode, ...]) -> None:
+        """Make the nodes that are new ready to tick; the first call begins the release grid."""
+        super().take_on(lives)
+        if self._begun:
+            return
+        self._begun = True
         self.timeline.begin(self._clock.now_ns())
         for live in self._in_order:
             self._join(live)
@@ -74,7 +75,7 @@ class Simulation(Stepper):
 
     def retime(self, live: LiveNode) -> None:
         """Move a node to the grid of its changed rate."""
-        self._releases.retime(live, self._clock.now_ns())
+        self._change(live, lambda: self._releases.retime(live, self._clock.now_ns()))
 
     def shut_down(self, lives: Iterable[LiveNode]) -> None:
         """Cancel async ticks, then call each node's `shutdown()` in reverse order."""
@@ -82,12 +83,21 @@ class Simulation(Stepper):
             task.cancel()
         self._settle()
         super().shut_down(lives)
-        self._releases.clear()
-        self._messaged.clear()
+
+    def close(self) -> None:
+        """Give back the event loop."""
+        if self._virtual is not None:
+            self._virtual.close()
+            self._virtual = None
+
+    def _virtual_loop(self) -> VirtualLoop:
+        if self._virtual is None:
+            self._virtual = VirtualLoop(self._clock)
+        return self._virtual
 
     def _add(self, live: LiveNode) -> None:
         super()._add(live)
-        if self._places and live in self._in_order:
+        if self._begun and live in self._in_order:
             self._join(live)
 
     def _remove(self, live: LiveNode) -> None:
@@ -119,48 +129,50 @@ class Simulation(Stepper):
 
     # -- time ----------------------------------------------------------------------
 
-    def advance(
-        self,
-        until_ns: int | None,
-        stopped: Callable[[], bool],
-        only: Collection[LiveNode] | None = None,
-    ) -> None:
+    def advance(self, until_ns: int | None, only: Collection[LiveNode] | None = None) -> None:
         """Simulate what happens before `until_ns`; None until stopped or nothing is left.
 
         Args:
             until_ns: The end, exclusive [ns].
-            stopped: Asked between ticks whether to end early.
             only: The nodes that may tick; None lets all of them.
         """
-        self._deliver(stopped, only)
-        while not stopped():
-            instant_ns = self._next_ns()
-            if instant_ns is None or (until_ns is not None and instant_ns >= until_ns):
-                break
-            self._clock.advance_to(instant_ns)
-            self._settle()
-            self._deliver(stopped, only)
-            while not stopped() and (due := self._releases.pop_due(instant_ns)) is not None:
-                live, release_ns = due
-                if only is None or live in only:
-                    self._release(live, release_ns)
-                    self._deliver(stopped, only)
-        if until_ns is not None and not stopped():
-            self._clock.advance_to(until_ns)
+        self.begin_driving()
+        try:
+            self._deliver(only)
+            while not self.stopped():
+                instant_ns = self._next_ns()
+                if instant_ns is None or (until_ns is not None and instant_ns >= until_ns):
+                    break
+                self._clock.advance_to(instant_ns)
+                self._settle()
+                self._deliver(only)
+                while not self.stopped() and (due := self._releases.pop_due(instant_ns)):
+                    live, release_ns = due
+                    if only is None or live in only:
+                        self._release(live, release_ns)
+                        self._deliver(only)
+            if until_ns is not None and not self.stopped():
+                self._clock.advance_to(until_ns)
+        finally:
+            self.end_driving()
 
-    def cycle(self, stopped: Callable[[], bool], named: Collection[LiveNode] | None) -> None:
+    def cycle(self, named: Collection[LiveNode] | None) -> None:
         """Advance by one cycle; nodes that are named tick in it exactly once, due or not."""
         grid = self.timeline.grid
         now_ns = self._clock.now_ns()
         end_ns = grid.at(grid.index_at(now_ns) + 1)
         if named is None:
-            self.advance(end_ns, stopped)
+            self.advance(end_ns)
             return
-        for live in sorted(named, key=self._places.__getitem__):
-            if live.trigger is None and not live.retired:
-                self._release(live, now_ns)
-            self._deliver(stopped, named)
-        self.advance(end_ns, stopped, only=())
+        self.begin_driving()
+        try:
+            for live in sorted(named, key=self._places.__getitem__):
+                if live.trigger is None and not live.retired:
+                    self._release(live, now_ns)
+                self._deliver(named)
+        finally:
+            self.end_driving()
+        self.advance(end_ns, only=())
 
     def _next_ns(self) -> int | None:
         timer_ns = self._virtual.next_timer_ns if self._virtual is not None else None
@@ -175,7 +187,7 @@ class Simulation(Stepper):
         if live in self._in_flight:
             live.counters.skipped += 1
             return
-        task = self._in_flight[live] = self.step_loop.loop.create_task(
+        task = self._in_flight[live] = self._virtual_loop().loop.create_task(
             self._async[live](release_ns),
             name=f"horus:{live.name}",
             context=live.context,
@@ -191,7 +203,7 @@ class Simulation(Stepper):
             finally:
                 self._callback_ended()
 
-    def _deliver(self, stopped: Callable[[], bool], only: Collection[LiveNode] | None) -> None:
+    def _deliver(self, only: Collection[LiveNode] | None) -> None:
         """Tick event nodes, one per message, until no message waits."""
         if not self._messaged:
             return
@@ -201,7 +213,7 @@ class Simulation(Stepper):
                 for live in self._messaged
                 if (only is None or live in only) and live not in self._in_flight
             ]
-            if not ready or stopped():
+            if not ready or self.stopped():
                 return
             self._tick_event(min(ready, key=self._places.__getitem__))
         raise StateError(
@@ -219,17 +231,13 @@ class Simulation(Stepper):
         if delay_ns:
             # Restarting: the messages wait for the end of the back-off.
             self._messaged.pop(live, None)
-            self.step_loop.loop.call_later(to_s(delay_ns), self._messaged.setdefault, live)
+            self._virtual_loop().loop.call_later(to_s(delay_ns), self._messaged.setdefault, live)
             self._settle()
             return
-        received = trigger.received
-
-        def ticked(_: object) -> None:
-            trigger.consume_one_since(received)
-
+        before = EventTick(live)
         self._release(live, self._clock.now_ns())
         task = self._in_flight.get(live)
         if task is None:
-            ticked(None)
+            before.settle()
         else:
-            task.add_done_callback(ticked)
+            task.add_done_callback(lambda _: before.settle())

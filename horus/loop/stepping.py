@@ -6,14 +6,14 @@ each node's tick path, and a private event loop for the async ones.
 
 from __future__ import annotations
 
-import asyncio
+import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
 
 from horus import clock
 from horus.clock import Timeline
-from horus.live import LiveNode
-from horus.loop.private_loop import StepLoop
+from horus.live import EventTick, LiveNode
+from horus.loop.private_loop import StepLoop, StuckError
 from horus.spec import NodeState
 from horus.tick_path import RunTick, RunTickAsync, build_async_tick, build_tick
 
@@ -21,38 +21,46 @@ from horus.tick_path import RunTick, RunTickAsync, build_async_tick, build_tick
 class Stepper:
     """Initialises, ticks and shuts down nodes on the calling thread.
 
-    Thread: one at a time.
+    Thread: one at a time drives; `add`, `remove` and `retime` may come from any.
     """
 
-    def __init__(self, timeline: Timeline) -> None:
-        """Begin with no nodes."""
+    def __init__(
+        self,
+        timeline: Timeline,
+        step_loop: Callable[[], StepLoop],
+        stopped: Callable[[], bool],
+    ) -> None:
+        """Begin with no nodes.
+
+        Args:
+            timeline: The scheduler's time.
+            step_loop: Returns the event loop of the async nodes.
+            stopped: Asked between callbacks whether to end early.
+        """
         self.timeline = timeline
+        self.step_loop = step_loop
+        self.stopped = stopped
         self._plain: dict[LiveNode, RunTick] = {}
         self._async: dict[LiveNode, RunTickAsync] = {}
-        self._in_order: list[LiveNode] = []
-        self._step_loop: StepLoop | None = None
+        self._in_order: tuple[LiveNode, ...] = ()
+        self._taken_on: tuple[LiveNode, ...] = ()
         self._depth = 0
-        self._changes: deque[Callable[[], None]] = deque()
+        self._driver: int | None = None
+        self._lock = threading.RLock()
+        self._changes: deque[Callable[[], object]] = deque()
 
-    @property
-    def step_loop(self) -> StepLoop:
-        """The private event loop of the async nodes, made when the first one needs it."""
-        if self._step_loop is None:
-            self._step_loop = self.make_loop()
-        return self._step_loop
-
-    def make_loop(self) -> StepLoop:
-        """Return a loop on real time."""
-        return StepLoop(asyncio.new_event_loop())
-
-    def start(self, lives: Iterable[LiveNode]) -> None:
-        """Begin with these nodes: call `init()` of each, in order."""
+    def take_on(self, lives: tuple[LiveNode, ...]) -> None:
+        """Make the nodes that are new ready to tick, calling `init()`, in order."""
+        if lives is self._taken_on:
+            return
         clock.set_ambient(self.timeline)
         for live in lives:
-            self.add(live)
+            if not self.stopped():
+                self._add(live)
+        self._taken_on = lives
 
     def add(self, live: LiveNode) -> None:
-        """Make a node ready to tick, calling `init()` if it has not been.
+        """Let a node take part that was added while others tick.
 
         Called from a callback, a plain node is ready at once, an async one when
         that callback has ended: its `init()` needs the loop.
@@ -75,9 +83,12 @@ class Stepper:
         self._depth += 1
         try:
             if live.is_async:
-                self.step_loop.run(live.run_phase_async(phase), live.context)
+                self.step_loop().run(live.run_phase_async(phase), live.context)
             else:
                 live.run_phase(phase)
+        except StuckError as exc:
+            live.phase_failed(phase, exc)
+            live.state = NodeState.ERROR if phase == "init" else live.state
         finally:
             self._callback_ended()
 
@@ -86,29 +97,44 @@ class Stepper:
         self._depth += 1
         try:
             if live.is_async:
-                self.step_loop.run(self._async[live](release_ns), live.context)
+                self.step_loop().run(self._async[live](release_ns), live.context)
             else:
                 self._plain[live](release_ns)
         finally:
             self._callback_ended()
 
-    def cycle(self, stopped: Callable[[], bool], named: Collection[LiveNode] | None) -> None:
+    def cycle(self, named: Collection[LiveNode] | None) -> None:
         """Tick the nodes once, in order, without rate control; only those named, if any are.
 
         An event node ticks once per message that waits when its turn comes.
         """
         timeline = self.timeline
         timeline.begin_step()
-        for live in self._in_order:
-            if live.retired or (named is not None and live not in named):
-                continue
-            if live.trigger is not None:
-                self._tick_per_message(live)
-            else:
-                self.tick(live, timeline.now_ns())
-            if stopped():
-                break
+        self.begin_driving()
+        try:
+            for live in self._in_order:
+                if live.retired or (named is not None and live not in named):
+                    continue
+                if live.trigger is not None:
+                    self._tick_per_message(live)
+                else:
+                    self.tick(live, timeline.now_ns())
+                if self.stopped():
+                    break
+        finally:
+            self.end_driving()
         timeline.end_step()
+
+    def begin_driving(self) -> None:
+        """Become the thread that makes changes of membership."""
+        self._driver = threading.get_ident()
+
+    def end_driving(self) -> None:
+        """Make the changes that others have asked for, and let them make their own."""
+        with self._lock:
+            while self._changes:
+                self._changes.popleft()()
+            self._driver = None
 
     def shut_down(self, lives: Iterable[LiveNode]) -> None:
         """Call `shutdown()` of each initialised node, in reverse order."""
@@ -118,19 +144,15 @@ class Stepper:
     def shut_down_one(self, live: LiveNode) -> None:
         """Call `shutdown()` of a node, if it is initialised."""
         live.leave_service()
-        if live.initialized:
-            live.state = NodeState.STOPPING
+        if live.claim_shutdown():
             self.run_phase(live, "shutdown")
             live.stopped()
 
     def close(self) -> None:
-        """Give the private loop back."""
-        if self._step_loop is not None:
-            self._step_loop.close()
-            self._step_loop = None
+        """Give back what is the stepper's own."""
 
     def _add(self, live: LiveNode) -> None:
-        if live.removed:
+        if live.removed or live in self._in_order:
             return
         if live.is_async:
             self._async[live] = build_async_tick(live)
@@ -139,19 +161,33 @@ class Stepper:
         if live.state is NodeState.UNINITIALIZED:
             self.run_phase(live, "init")
         live.enter_service()
-        self._in_order = sorted([*self._in_order, live], key=lambda live: live.rank)
+        self._in_order = tuple(sorted((*self._in_order, live), key=lambda live: live.rank))
 
     def _remove(self, live: LiveNode) -> None:
-        self._in_order = [other for other in self._in_order if other is not live]
+        self._in_order = tuple(other for other in self._in_order if other is not live)
         self.shut_down_one(live)
         self._plain.pop(live, None)
         self._async.pop(live, None)
 
     def _change(self, live: LiveNode, change: Callable[[], None]) -> None:
-        """Change who takes part: now, or when the callback on the stack below has ended."""
-        if self._depth and (live.is_async or live.ticking):
-            self._changes.append(change)
-        else:
+        """Change who takes part: now, or when the callback on the stack below has ended.
+
+        Asked from another thread than the one that drives, wait for that one.
+        """
+        made = threading.Event()
+
+        def make() -> None:
+            change()
+            made.set()
+
+        with self._lock:
+            elsewhere = self._driver not in (None, threading.get_ident())
+            deferred = elsewhere or (self._depth and (live.is_async or live.ticking))
+            if deferred:
+                self._changes.append(make)
+        if elsewhere:
+            made.wait()
+        elif not deferred:
             change()
 
     def _callback_ended(self) -> None:
@@ -164,8 +200,8 @@ class Stepper:
         trigger = live.trigger
         assert trigger is not None
         for _ in range(len(trigger.queue)):
-            received = trigger.received
+            before = EventTick(live)
             self.tick(live, self.timeline.now_ns())
-            trigger.consume_one_since(received)
-            if not trigger.queue:
+            before.settle()
+            if not trigger.queue or live.retired:
                 return

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import sys
 import threading
 import traceback
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 _log = logging.getLogger("horus.supervisor")
@@ -25,6 +26,7 @@ class Supervisor:
     def __init__(self, name: str) -> None:
         """Prepare the thread of the scheduler called `name`."""
         self._loop = asyncio.new_event_loop()
+        self._tasks: set[asyncio.Task[None]] = set()
         self._thread = threading.Thread(
             target=self._serve, name=f"horus-supervisor:{name}", daemon=True
         )
@@ -33,12 +35,16 @@ class Supervisor:
         """Start the thread."""
         self._thread.start()
 
-    def spawn(self, task: Coroutine[Any, Any, None]) -> None:
+    def spawn(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Run a supervision task; after `close` there is nothing left to supervise."""
-        try:
-            asyncio.run_coroutine_threadsafe(task, self._loop)
-        except RuntimeError:
-            task.close()
+
+        def start() -> None:
+            task = self._loop.create_task(work())
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(start)
 
     def close(self) -> None:
         """Cancel what runs and end the thread."""

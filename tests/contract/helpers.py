@@ -5,6 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import inspect
+import os
+import subprocess
+import sys
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
@@ -77,6 +81,15 @@ def wait_until(condition: Callable[[], object], patience_s: float = PATIENCE_S) 
         time.sleep(0.001)
 
 
+async def until(condition: Callable[[], object]) -> None:
+    """Return as soon as `condition()` holds, leaving the loop to others meanwhile."""
+    for _ in range(int(PATIENCE_S / 0.001)):
+        if condition():
+            return
+        await asyncio.sleep(0.001)
+    raise AssertionError(f"not so within {PATIENCE_S} s")
+
+
 @contextlib.contextmanager
 def running(sched: Scheduler) -> Iterator[threading.Thread]:
     """Run a scheduler on a thread of its own while the block runs, then stop it.
@@ -145,6 +158,20 @@ def run_async(work: Coroutine[Any, Any, T], loop: str) -> T:
     factory = uvloop.new_event_loop if loop == "uvloop" else asyncio.new_event_loop
     with asyncio.Runner(loop_factory=factory) as runner:
         return runner.run(work)
+
+
+def run_program(text: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a robot program in a process of its own, to a good end."""
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(text)],
+        capture_output=True,
+        env={**os.environ, **environment},
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done
 
 
 def record_ticks(journal: list[Any], value: Callable[[], T]) -> Callable[[Node], None]:

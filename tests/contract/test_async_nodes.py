@@ -14,7 +14,15 @@ from aiohttp import web
 import horus
 from horus import Node, ms
 
-from .helpers import all_have_ticked, nothing, run_async, run_until, running, wait_until
+from .helpers import (
+    all_have_ticked,
+    nothing,
+    run_async,
+    run_until,
+    running,
+    until,
+    wait_until,
+)
 
 
 async def nap(node: Node) -> None:
@@ -421,7 +429,9 @@ def test_publish_from_another_thread_reaches_the_nodes(make, loop):
     with running(sched):
         wait_until(lambda: sched.get_node_stats("rt")["total_ticks"] > 0)
         threads = [
-            threading.Thread(target=lambda base=base: [sched.publish("go", base + i) for i in range(50)])
+            threading.Thread(
+                target=lambda base=base: [sched.publish("go", base + i) for i in range(50)]
+            )
             for base in (0, 100, 200)
         ]
         for thread in threads:
@@ -464,8 +474,7 @@ def test_arun_beside_a_web_server(make, loop):
         url = f"http://127.0.0.1:{server.addresses[0][1]}/?speed=1.5"
         speeds = sched.subscribe("speed")
         async with sched:
-            while not all_have_ticked(sched):
-                await asyncio.sleep(1 * ms)
+            await until(lambda: all_have_ticked(sched))
             async with aiohttp.ClientSession() as session, session.get(url) as response:
                 nodes = (await response.json())["nodes"]
             async with asyncio.timeout(10.0):

@@ -117,9 +117,7 @@ def test_the_deadline_runs_from_the_release_not_from_the_start(make, loop):
     # Released at the same instants and ordered first, the hog delays every start.
     sched.add(Node("hog", lambda node: time.sleep(60 * ms), order=0))
     sched.set_node_rate("hog", 10)
-    sched.add(
-        Node("punctual", punctual, rate=10, order=1, budget=30 * ms, deadline=30 * ms)
-    )
+    sched.add(Node("punctual", punctual, rate=10, order=1, budget=30 * ms, deadline=30 * ms))
 
     sched.run(duration=0.35)
 

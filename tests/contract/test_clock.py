@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import threading
 import time
 
@@ -21,7 +22,6 @@ from .helpers import (
     running,
     wait_until,
 )
-
 
 # -- in callbacks, normal mode ---------------------------------------------------------------
 
@@ -68,7 +68,7 @@ def test_dt_is_the_actual_time_since_the_last_tick(make, loop, kind):
 
     run_until(sched, lambda: len(seen) >= 6)
 
-    for (earlier, _), (later, dt) in zip(seen, seen[1:], strict=False):
+    for (earlier, _), (later, dt) in itertools.pairwise(seen):
         assert dt == pytest.approx(later - earlier, abs=20 * ms)
     # The tick of 80 ms shows in the next one's dt, which a nominal dt would hide.
     assert seen[3][1] >= 75 * ms
@@ -134,7 +134,7 @@ def test_tick_is_a_monotonically_increasing_counter(make, loop, kind):
 
     run_until(sched, lambda: len(seen) >= 5)
 
-    assert all(later > earlier for earlier, later in zip(seen, seen[1:], strict=False)) or (
+    assert all(later > earlier for earlier, later in itertools.pairwise(seen)) or (
         kind == "Event" and seen == sorted(seen)
     )
 
@@ -152,7 +152,7 @@ def test_tick_goes_on_counting_over_steps_and_runs(make, deterministic):
     sched.run(duration=0.05)
 
     assert seen[:3] == [0, 1, 2]
-    assert all(later > earlier for earlier, later in zip(seen, seen[1:], strict=False))
+    assert all(later > earlier for earlier, later in itertools.pairwise(seen))
 
 
 def test_budget_remaining_counts_down_to_zero(make):
@@ -341,7 +341,11 @@ def random_trace(make, **options):
     sched = make(tick_rate=100, deterministic=True, **options)
     for name in ("a", "b"):
         sched.add(
-            Node(name, lambda n: seen.append((n.name, horus.rng_float(), horus.rng_float())), rate=100)
+            Node(
+                name,
+                lambda n: seen.append((n.name, horus.rng_float(), horus.rng_float())),
+                rate=100,
+            )
         )
     sched.tick_for(0.2)
     return seen

@@ -46,9 +46,7 @@ def test_compute_runs_on_a_thread_instead_of_the_main_loop(make, loop):
             pubs=["path"],
         )
     )
-    sched.add(
-        Node("tracker", lambda n: paths.extend(n.recv_all("path")), order=60, subs=["path"])
-    )
+    sched.add(Node("tracker", lambda n: paths.extend(n.recv_all("path")), order=60, subs=["path"]))
     sched.publish("map", {"width": 11, "height": 11})
 
     with running(sched):

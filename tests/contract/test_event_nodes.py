@@ -244,9 +244,7 @@ def test_a_flood_of_events_leaves_the_loop_its_turn(make, loop):
     sched.add(Node("logger", lambda: ticks.append(1)))
     sched.publish("go", 1)
 
-    run_until(
-        sched, lambda: len(ticks) >= 4 and sched.get_node_stats("event")["total_ticks"] >= 10
-    )
+    run_until(sched, lambda: len(ticks) >= 4 and sched.get_node_stats("event")["total_ticks"] >= 10)
 
 
 @pytest.mark.realtime
@@ -254,9 +252,7 @@ def test_an_event_node_that_frees_the_loop_answers_quickly(make, loop):
     """A message wakes its node at once, not at the next tick of some timer."""
     delays = []
     sched = make(loop=loop)
-    sched.add(
-        Node("event", lambda n: delays.append(time.monotonic() - n.recv("go")), on="go")
-    )
+    sched.add(Node("event", lambda n: delays.append(time.monotonic() - n.recv("go")), on="go"))
     sched.add(Node("sender", lambda n: n.send("go", time.monotonic()), rate=50, pubs=["go"]))
 
     run_until(sched, lambda: len(delays) >= 15)

@@ -87,7 +87,7 @@ def test_you_do_not_set_the_class_directly(argument):
     ids=str,
 )
 def test_contradicting_configurations_are_errors_that_say_why(configuration, words):
-    """compute with on, compute with async, and on with rate are errors that say why."""
+    """Compute with on, compute with async, and on with rate are errors that say why."""
     with pytest.raises(ConfigError) as refused:
         Node("node", **{"tick": nothing, **configuration})
     assert all(word in str(refused.value) for word in words)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import threading
 import time
 
@@ -20,6 +21,7 @@ from .helpers import (
     record_ticks,
     run_async,
     run_until,
+    until,
 )
 
 
@@ -262,7 +264,7 @@ def test_the_global_tick_rate_is_maintained(make, loop):
 
     sched.run(duration=0.4)
 
-    steps = {later - earlier for earlier, later in zip(cycles, cycles[1:], strict=False)}
+    steps = {later - earlier for earlier, later in itertools.pairwise(cycles)}
     assert cycles[0] % 4 == 0
     assert all(step % 4 == 0 for step in steps)
     assert sched.current_tick() >= 80
@@ -284,8 +286,7 @@ def test_the_scheduler_runs_beside_an_application_on_its_loop(make, loop):
     async def main():
         loops["application"] = asyncio.get_running_loop()
         async with sched:
-            while "node" not in loops:
-                await asyncio.sleep(1 * ms)
+            await until(lambda: "node" in loops)
 
     run_async(main(), loop)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import threading
 
 import pytest
@@ -144,7 +145,7 @@ def test_no_policy_means_log_with_traceback_count_and_keep_ticking(sched, caplog
 
 
 def test_fatal_stops_the_entire_scheduler(sched):
-    """"fatal": stop the entire scheduler, in order; no node ticks any more."""
+    """Policy "fatal": stop the entire scheduler, in order; no node ticks any more."""
     journal = []
     sched.add(
         Node(
@@ -240,7 +241,7 @@ def test_after_a_fatal_error_the_scheduler_can_run_again(sched):
 
 
 def test_restart_reinitializes_the_node_and_resumes(sched):
-    """"restart": re-initialize the node and resume."""
+    """Policy "restart": re-initialize the node and resume."""
     journal = []
     fail = failing(1)
 
@@ -283,7 +284,7 @@ def test_restart_backs_off_exponentially_from_100_ms_to_5_s(make):
 
     sched.tick_for(25.0)
 
-    waits = [later - earlier for earlier, later in zip(inits, inits[1:], strict=False)]
+    waits = [later - earlier for earlier, later in itertools.pairwise(inits)]
     expected = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0]
     assert waits[: len(expected)] == pytest.approx(expected[: len(waits)], abs=0.0101)
     assert len(waits) >= 8
@@ -337,9 +338,7 @@ def test_a_restarting_node_says_so(sched):
     """While it waits for its restart, the node's state is "restarting"."""
     states = []
     sched.add(Node("node", failing(0), rate=10, order=0, failure_policy="restart"))
-    sched.add(
-        Node("watch", lambda: states.append(sched.get_node_stats("node")["state"]), rate=10)
-    )
+    sched.add(Node("watch", lambda: states.append(sched.get_node_stats("node")["state"]), rate=10))
 
     sched.tick_for(0.5)
 
@@ -398,7 +397,7 @@ def test_the_messages_of_a_restarting_event_node_wait(sched):
 
 
 def test_skip_skips_this_tick_and_tries_again_next_cycle(sched, caplog):
-    """"skip": skip this tick, try again next cycle; a warning without traceback."""
+    """Policy "skip": skip this tick, try again next cycle; a warning without traceback."""
     times = []
     sched.add(Node("cloud", failing(0, 1, journal=times), rate=10, failure_policy="skip"))
 
@@ -431,7 +430,7 @@ def test_network_glitches_do_not_stop_the_robot(sched):
 
 
 def test_ignore_logs_the_error_and_continues(sched, caplog):
-    """"ignore": log the error and continue."""
+    """Policy "ignore": log the error and continue."""
     times = []
     sched.add(Node("node", failing(0, journal=times), rate=10, failure_policy="ignore"))
 

@@ -71,9 +71,7 @@ def test_init_order_is_by_order_then_insertion_in_every_mode(make, way, determin
     journal = []
     sched = make(tick_rate=100, deterministic=deterministic)
     for name, order in (("late", 50), ("early_1", 5), ("early_2", 5), ("first", 0)):
-        sched.add(
-            Node(name, nothing, rate=100, order=order, init=lambda n: journal.append(n.name))
-        )
+        sched.add(Node(name, nothing, rate=100, order=order, init=lambda n: journal.append(n.name)))
 
     advance(sched, way)
 
@@ -209,9 +207,7 @@ def test_what_init_sends_is_received_in_the_first_tick(make, deterministic):
     received = []
     sched = make(tick_rate=100, deterministic=deterministic)
     sched.add(Node("driver", nothing, rate=100, order=0, init=lambda n: n.send("up", True)))
-    sched.add(
-        Node("app", lambda n: received.append(n.recv("up")), rate=100, order=1, subs=["up"])
-    )
+    sched.add(Node("app", lambda n: received.append(n.recv("up")), rate=100, order=1, subs=["up"]))
 
     sched.tick_once()
 

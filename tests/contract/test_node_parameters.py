@@ -120,7 +120,7 @@ def test_everything_but_name_and_tick_is_keyword_only():
 
 
 def test_us_and_ms_convert_to_seconds():
-    """us = 1e-6 and ms = 1e-3: plain floats that make seconds."""
+    """Us = 1e-6 and ms = 1e-3: plain floats that make seconds."""
     assert us == 1e-6
     assert ms == 1e-3
     assert isinstance(300 * us, float)

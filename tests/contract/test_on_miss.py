@@ -45,7 +45,7 @@ def sched(make):
 
 
 def test_warn_is_the_default(sched, caplog):
-    """"warn" is the default: log a warning, continue normally."""
+    """The default policy is "warn": log a warning, continue normally."""
     times = []
     sched.add(timed(script(SLOW, journal=times)))
 
@@ -58,12 +58,10 @@ def test_warn_is_the_default(sched, caplog):
 
 
 def test_warn_logs_a_warning_and_continues_normally(sched, caplog):
-    """"warn": the warning names the limit and the excess; nothing else changes."""
+    """Policy "warn": the warning names the limit and the excess; nothing else changes."""
     times = []
     hooks = []
-    sched.add(
-        timed(script(LATE, LATE, journal=times), on_miss="warn", safe_state=as_hook(hooks))
-    )
+    sched.add(timed(script(LATE, LATE, journal=times), on_miss="warn", safe_state=as_hook(hooks)))
 
     sched.tick_for(0.4)
 
@@ -140,7 +138,7 @@ def test_no_policy_fires_for_ticks_that_meet_their_limits(sched, policy, caplog)
 
 
 def test_skip_drops_exactly_the_next_release(sched):
-    """"skip": skip this node's next tick to recover, exactly that one."""
+    """Policy "skip": skip this node's next tick to recover, exactly that one."""
     times = []
     sched.add(timed(script(FAST, SLOW, FAST, LATE, journal=times), on_miss="skip"))
 
@@ -151,7 +149,7 @@ def test_skip_drops_exactly_the_next_release(sched):
 
 
 def test_skip_does_not_skip_other_nodes(sched):
-    """"skip" skips this node's next tick, nobody else's."""
+    """Policy "skip" skips this node's next tick, nobody else's."""
     times = []
     sched.add(timed(script(SLOW, SLOW, SLOW), on_miss="skip"))
     sched.add(Node("other", lambda: times.append(horus.now()), rate=10))
@@ -185,7 +183,7 @@ def test_skip_works_in_steps_for_every_class(make, kind):
 
 
 def test_safe_mode_calls_enter_safe_state_on_the_node(sched):
-    """"safe_mode": call enter_safe_state() on the node."""
+    """Policy "safe_mode": call enter_safe_state() on the node."""
     journal = []
 
     class Motor(Node):
@@ -300,12 +298,10 @@ def test_the_safe_state_hook_runs_where_the_node_ticks(make, loop, kind):
 
 
 def test_stop_ends_the_run_in_order(sched):
-    """"stop": stop the entire scheduler, in order; run() returns."""
+    """Policy "stop": stop the entire scheduler, in order; run() returns."""
     journal = []
     sched.add(
-        timed(
-            script(FAST, SLOW), on_miss="stop", order=0, shutdown=as_hook(journal, "safety down")
-        )
+        timed(script(FAST, SLOW), on_miss="stop", order=0, shutdown=as_hook(journal, "safety down"))
     )
     sched.add(
         Node(

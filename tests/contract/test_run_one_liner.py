@@ -55,9 +55,7 @@ def test_the_one_liner_of_the_contract_runs():
     ctrl = horus.Node(
         name="controller", tick=navigate, rate=30, order=10, subs=["scan"], pubs=["cmd"]
     )
-    motor = horus.Node(
-        name="motor", tick=drive, rate=1000, order=20, budget=300 * us, subs=["cmd"]
-    )
+    motor = horus.Node(name="motor", tick=drive, rate=1000, order=20, budget=300 * us, subs=["cmd"])
 
     with pytest.warns(UnavailableWarning):
         horus.run(sensor, ctrl, motor, rt=True, watchdog_ms=500, duration=0.4)

@@ -21,6 +21,7 @@ from .helpers import (
     run_async,
     run_until,
     running,
+    until,
     wait_until,
 )
 
@@ -42,9 +43,7 @@ def test_set_node_rate_changes_the_rate_between_timed_runs(make, kind):
         ticks.clear()
         sched.tick_for(1.0)
         counts.append(len(ticks))
-        assert ticks == pytest.approx(
-            [ticks[0] + k / rate for k in range(len(ticks))], abs=1e-6
-        )
+        assert ticks == pytest.approx([ticks[0] + k / rate for k in range(len(ticks))], abs=1e-6)
         assert sched.get_node_stats("sensor")["rate"] == rate
 
     assert counts == [100, 20, 500]
@@ -277,9 +276,7 @@ def test_a_tick_may_remove_any_other_node(make, remover, victim):
             journal.append(sched.remove_node("victim"))
 
     sched.add(node_of(remover, "remover", remove, order=0))
-    sched.add(
-        node_of(victim, "victim", order=1, shutdown=lambda node: journal.append("shutdown"))
-    )
+    sched.add(node_of(victim, "victim", order=1, shutdown=lambda node: journal.append("shutdown")))
 
     run_until(sched, lambda: "shutdown" in journal)
 
@@ -434,8 +431,7 @@ def test_an_application_mutates_beside_arun(make, loop):
     async def main():
         async with sched:
             sched.add(Node("second", lambda: ticks.append(1), rate=100))
-            while len(ticks) < 3:
-                await asyncio.sleep(1 * ms)
+            await until(lambda: len(ticks) >= 3)
             assert sched.remove_node("second") is True
             count = len(ticks)
             await asyncio.sleep(50 * ms)

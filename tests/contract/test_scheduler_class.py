@@ -30,6 +30,7 @@ from .helpers import (
     run_async,
     run_until,
     running,
+    until,
     wait_until,
 )
 
@@ -202,9 +203,7 @@ def test_the_context_manager_calls_stop_automatically_on_exit(loop):
     journal = []
     with Scheduler(tick_rate=100, loop=loop) as sched:
         sched.add(Node("sensor", nothing, rate=100, order=0, shutdown=lambda: journal.append("s")))
-        sched.add(
-            Node("logger", nothing, rate=10, order=100, shutdown=lambda: journal.append("l"))
-        )
+        sched.add(Node("logger", nothing, rate=10, order=100, shutdown=lambda: journal.append("l")))
         sched.run(duration=0.05)
     assert journal == ["l", "s"]
     assert sched.status() == "stopped"
@@ -267,15 +266,12 @@ def test_the_async_context_manager_runs_in_the_background(make, loop):
     """`async with Scheduler()` runs beside the application and shuts down at the end."""
     journal = []
     sched = make(tick_rate=100)
-    sched.add(
-        Node("node", lambda: journal.append("tick"), shutdown=lambda: journal.append("down"))
-    )
+    sched.add(Node("node", lambda: journal.append("tick"), shutdown=lambda: journal.append("down")))
 
     async def main():
         async with sched:
             assert sched.is_running()
-            while not journal:
-                await asyncio.sleep(1 * ms)
+            await until(lambda: journal)
         return list(journal)
 
     result = run_async(main(), loop)
@@ -297,8 +293,7 @@ def test_the_async_context_manager_raises_what_a_fatal_node_raised(make, loop):
 
     async def main():
         async with sched:
-            while sched.is_running():
-                await asyncio.sleep(1 * ms)
+            await until(lambda: not sched.is_running())
 
     with pytest.raises(NodeError, match="gone"):
         run_async(main(), loop)

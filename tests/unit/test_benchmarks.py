@@ -126,6 +126,13 @@ def test_the_table_says_failed_instead_of_inventing_a_figure() -> None:
     assert harness.table_rows(runs, [MEASURE], ["ours"])[0][-2:] == ("target", "met")
 
 
+def test_the_report_names_every_failed_run() -> None:
+    """A median over fewer rounds than were run is not passed off as one over all."""
+    runs = [child_run(1, "ours", 1.0), child_run(2, "ours", error="it crashed")]
+    text = micro.report(runs, ["ours"], {}, only=[], markdown=False)
+    assert "round 2, w of ours failed: it crashed" in text
+
+
 def test_the_text_table_is_aligned_and_the_markdown_table_is_markdown() -> None:
     """Columns start at the same offset on every line; Markdown has a rule under its header."""
     rows = [("measure", "met"), ("a long name", "yes"), ("b", "no")]

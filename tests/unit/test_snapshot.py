@@ -198,9 +198,14 @@ def test_arrays_are_copied_once_and_arrive_read_only() -> None:
     image[:] = 0
     one = thaw(payload)["image"]
     assert one.tolist() == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
-    assert one is thaw(payload)["image"]
+    two = thaw(payload)["image"]
+    assert np.shares_memory(one, two)
     with pytest.raises(ValueError, match="read-only"):
         one[0, 0] = 1.0
+    with pytest.raises(ValueError, match="WRITEABLE"):
+        one.flags.writeable = True
+    one.shape = (6,)
+    assert two.shape == (2, 3)
 
 
 def test_a_view_does_not_keep_its_base() -> None:
@@ -208,6 +213,84 @@ def test_a_view_does_not_keep_its_base() -> None:
     payload, _ = freeze(np.zeros(1_000_000)[:3])
     assert payload.base is None
     assert payload.nbytes == 24
+
+
+@dataclasses.dataclass(frozen=True)
+class FixedScanOf:
+    ranges: Any
+
+
+class FixedStructOf(msgspec.Struct, frozen=True):
+    ranges: Any
+
+
+class Key:
+    """Hashable by identity, as every plain class is, and anything but immutable."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def __deepcopy__(self, memo: Any) -> Key:
+        fresh = Key()
+        fresh.notes = list(self.notes)
+        return fresh
+
+
+@pytest.mark.parametrize(
+    ("message", "inner"),
+    [
+        (FixedScanOf([1.0]), lambda m: m.ranges),
+        (FixedStructOf({"a": [1.0]}), lambda m: m.ranges["a"]),
+        ({Key(): 1}, lambda m: next(iter(m)).notes),
+        ({1, Key()}, lambda m: next(k for k in m if isinstance(k, Key)).notes),
+        (frozenset({Key()}), lambda m: next(iter(m)).notes),
+        ((1, {"a": (2, [3])}), lambda m: m[1]["a"][1]),
+    ],
+    ids=["dataclass", "struct", "key", "set", "frozenset", "tuple"],
+)
+def test_frozen_outside_does_not_mean_frozen_inside(message: Any, inner: Any) -> None:
+    """A mutable part of an immutable-looking message is isolated all the same."""
+    payload, thaw = freeze(message)
+    assert thaw is not None
+    one, two = thaw(payload), thaw(payload)
+    inner(one).append("changed")
+    inner(message).append("changed")
+    assert "changed" not in inner(two)
+    assert "changed" not in inner(thaw(payload))
+
+
+def test_attributes_that_are_no_fields_are_isolated() -> None:
+    """What `__post_init__` adds to a dataclass belongs to the message, too."""
+    pose = Pose(1.0)
+    pose.extra = [1]  # type: ignore[attr-defined]
+    one, two = received(pose), received(pose)
+    one.extra.append(2)
+    assert pose.extra == two.extra == [1]  # type: ignore[attr-defined]
+
+
+def test_structured_scalars_do_not_share_the_sender_s_memory() -> None:
+    """A record taken from a structured array is a view of it, and is copied."""
+    table = np.zeros(2, dtype=[("x", "f8")])
+    record = received(table[0])
+    table["x"] = 7.0
+    assert record["x"] == 0.0
+
+
+def test_shared_parts_do_not_cost_time_without_end() -> None:
+    """A structure that refers to the same part again and again is copied in reasonable time."""
+    shared: list[Any] = [1.0]
+    for _ in range(40):
+        shared = [shared, shared]
+    payload, thaw = freeze(shared)
+    assert thaw is not None
+    assert type(thaw(payload)[0][0]) is list
+
+
+def test_an_error_says_where() -> None:
+    """The path to what cannot be sent is part of the error."""
+    with pytest.raises(UnsendableError) as caught:
+        freeze({"map": {"cells": [1, threading.Lock()]}})
+    assert caught.value.path == "['map']['cells'][1]"
 
 
 @pytest.mark.parametrize("inner", [np.float64(1.0), True, 1, "x"], ids=repr)
@@ -241,5 +324,5 @@ def test_a_message_that_contains_itself_is_refused() -> None:
     """Endless messages end in an error, not in a hang."""
     endless: list[Any] = []
     endless.append(endless)
-    with pytest.raises(RecursionError):
+    with pytest.raises(UnsendableError, match="contains itself"):
         freeze(endless)
