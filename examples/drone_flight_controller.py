@@ -5,6 +5,9 @@
     python examples/drone_flight_controller.py --strict          # ends at the first late ESC tick
     python examples/drone_flight_controller.py --deterministic --duration 8    # ends in the air
 
+With `--esc-on-miss stop --esc-deadline-us 15000 --stall-at 8`, one late ESC tick in the air ends
+the run, and the ESC brings the drone down on its own.
+
 The drone calibrates its gyroscope, takes off, flies round a square of 4 m in a breeze with a gust,
 lands and stops its motors. It knows its attitude and position only from noisy sensors. However a
 run ends, the ESC brings the drone down and stops the motors before the sensors disconnect. The
@@ -257,7 +260,7 @@ def policies(args: argparse.Namespace) -> Policies:
         attitude |= {"budget": 200 * us, "deadline": 500 * us}
         esc |= {"budget": 100 * us, "deadline": 200 * us}
     if args.esc_deadline_us is not None:
-        esc |= {"deadline": args.esc_deadline_us * us, "budget": args.esc_deadline_us * us / 2}
+        esc |= {"deadline": args.esc_deadline_us * us, "budget": args.esc_deadline_us * us}
     scheduler: dict[str, Any] = {
         "watchdog_ms": args.watchdog_ms,
         "blackbox_mb": args.blackbox_mb,

@@ -228,25 +228,26 @@ class TickContext:
 current: ContextVar[TickContext | None] = ContextVar("horus_tick", default=None)
 """The context of the callback that is running here, if one is."""
 
-_ambient: weakref.ref[Timeline] | None = None
+_ambient: list[weakref.ref[Timeline]] = []
 
 
 def set_ambient(timeline: Timeline) -> None:
-    """Let the clock functions answer for `timeline` when called outside callbacks."""
-    global _ambient
+    """Let the clock functions answer for `timeline` when called outside callbacks.
+
+    With several schedulers, the one that began last answers, until it ends.
+    """
     if _outside() is not timeline:
-        _ambient = weakref.ref(timeline)
+        clear_ambient(timeline)
+        _ambient.append(weakref.ref(timeline))
 
 
 def clear_ambient(timeline: Timeline) -> None:
-    """Forget `timeline`, if it is the one in force."""
-    global _ambient
-    if _outside() is timeline:
-        _ambient = None
+    """Forget `timeline`."""
+    _ambient[:] = [ref for ref in _ambient if ref() not in (None, timeline)]
 
 
 def _outside() -> Timeline | None:
-    return _ambient() if _ambient is not None else None
+    return _ambient[-1]() if _ambient else None
 
 
 def now() -> float:

@@ -44,6 +44,13 @@ class Control(Protocol):
         """Take note that a deadline was missed."""
 
 
+class Limits(NamedTuple):
+    """What a tick is measured against; replaced as a whole, read once per tick."""
+
+    budget_ns: int
+    deadline_ns: int
+
+
 class Admission(Enum):
     """Whether a released node may tick."""
 
@@ -132,8 +139,10 @@ class LiveNode:
         """Take over a configuration: rate and limits hold from the next tick on."""
         self.spec = spec
         self.period_ns = spec.period_ns
-        self.budget_ns = NO_LIMIT_NS if spec.budget_ns is None else spec.budget_ns
-        self.deadline_ns = NO_LIMIT_NS if spec.deadline_ns is None else spec.deadline_ns
+        self.limits = Limits(
+            NO_LIMIT_NS if spec.budget_ns is None else spec.budget_ns,
+            NO_LIMIT_NS if spec.deadline_ns is None else spec.deadline_ns,
+        )
         context = self.tick_context
         context.budget_ns = spec.budget_ns
         context.nominal_dt_s = 1.0 / spec.rate_hz
@@ -217,6 +226,18 @@ class LiveNode:
         if not success:
             self.emit(logging.ERROR, "excluded from ticking, because init() failed")
 
+    def broken(self, exc: BaseException) -> None:
+        """End the run because something escaped the tick path: a logging filter, say.
+
+        The tick path and `run_phase` hold on to what callbacks raise, so this is
+        not the node's fault alone; but a node that silently ticks no more must
+        not look healthy.
+        """
+        self.leave_service()
+        failure = NodeError(self.name, "tick", exc)
+        failure.__cause__ = exc
+        self.control.fail(failure)
+
     def renew(self) -> None:
         """Get ready for another `init()`: a new run begins."""
         if not self.initialized:
@@ -251,6 +272,8 @@ class LiveNode:
         if self.state is NodeState.STOPPING:
             self.state = NodeState.STOPPED
         self.gated = True
+        if self.removed:
+            self.core.disconnect()
 
     def regate(self) -> None:
         """Close or open the gate as the state demands."""
@@ -323,12 +346,12 @@ class LiveNode:
             )
         self.notify_error(exc)
 
-    def limit_exceeded(self, over_budget_ns: int, past_deadline_ns: int) -> str:
+    def limit_exceeded(self, limits: Limits, over_budget_ns: int, past_deadline_ns: int) -> str:
         """Log an exceeded limit (rate limited); return its description."""
         if past_deadline_ns > 0:
-            over_ns, kind, limit_ns = past_deadline_ns, "deadline", self.deadline_ns
+            over_ns, kind, limit_ns = past_deadline_ns, "deadline", limits.deadline_ns
         else:
-            over_ns, kind, limit_ns = over_budget_ns, "budget", self.budget_ns
+            over_ns, kind, limit_ns = over_budget_ns, "budget", limits.budget_ns
         text = f"exceeded its {kind} of {readable(limit_ns)} by {readable(over_ns)}"
         summary = self._limit_log.note(self.timeline.now_ns(), over_ns)
         if summary is not None and summary.held_back:

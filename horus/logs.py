@@ -11,8 +11,8 @@ import threading
 from collections.abc import Iterator
 
 _root = logging.getLogger("horus")
-_unwritten: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
-_LAST_RECORD_S = 0.05
+_MOST_UNWRITTEN = 10_000
+_LAST_RECORDS_S = 1.0
 
 
 @contextlib.contextmanager
@@ -41,29 +41,47 @@ def visible(*, install: bool, verbose: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stderr_handler() -> Iterator[None]:
-    screen = logging.StreamHandler(sys.stderr)
-    screen.setFormatter(_Formatter())
-    writer = logging.handlers.QueueListener(_unwritten, screen)
-    handler = logging.handlers.QueueHandler(_unwritten)
+    writer = _Writer()
+    handler = _BoundedHandler(writer.records)
     _root.addHandler(handler)
     writer.start()
     try:
         yield
     finally:
         _root.removeHandler(handler)
-        writer.stop()
+        writer.finish()
 
 
-def flush(timeout_s: float = 0.5) -> None:
-    """Wait until what was logged is written, at most `timeout_s` [s]."""
-    pause = threading.Event()
-    for _ in range(int(timeout_s / _LAST_RECORD_S)):
-        # An empty queue is not enough: its last record is still on its way.
-        drained = _unwritten.empty()
-        pause.wait(_LAST_RECORD_S)
-        if drained:
-            break
-    logging.shutdown()
+class _BoundedHandler(logging.handlers.QueueHandler):
+    """Hands records to the writer; when that cannot keep up, they are dropped."""
+
+    def __init__(self, records: queue.SimpleQueue[logging.LogRecord | None]) -> None:
+        super().__init__(records)
+        self._records = records
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """Queue a record; a terminal that nobody reads must not fill the memory."""
+        if self._records.qsize() < _MOST_UNWRITTEN:
+            self._records.put(record)
+
+
+class _Writer(threading.Thread):
+    """Writes records to stderr. A daemon: stderr may block for ever."""
+
+    def __init__(self) -> None:
+        super().__init__(name="horus-log", daemon=True)
+        self.records: queue.SimpleQueue[logging.LogRecord | None] = queue.SimpleQueue()
+        self._screen = logging.StreamHandler(sys.stderr)
+        self._screen.setFormatter(_Formatter())
+
+    def run(self) -> None:
+        while (record := self.records.get()) is not None:
+            self._screen.handle(record)
+
+    def finish(self) -> None:
+        """Let the last records be written, for as long as that may take."""
+        self.records.put(None)
+        self.join(_LAST_RECORDS_S)
 
 
 class _Formatter(logging.Formatter):

@@ -94,11 +94,11 @@ class Node:
             TopicError: A topic name was refused.
         """
         callbacks = {
-            "tick": self.__pick("tick", tick),
-            "init": self.__pick("init", init),
-            "shutdown": self.__pick("shutdown", shutdown),
-            "safe_state": self.__pick("safe_state", safe_state, method="enter_safe_state"),
-            "on_error": self.__pick("on_error", on_error),
+            "tick": self._horus_pick("tick", tick),
+            "init": self._horus_pick("init", init),
+            "shutdown": self._horus_pick("shutdown", shutdown),
+            "safe_state": self._horus_pick("safe_state", safe_state, method="enter_safe_state"),
+            "on_error": self._horus_pick("on_error", on_error),
         }
         if callbacks["tick"] is None:
             raise ConfigError("tick", tick, "a node needs a tick function or a tick() method")
@@ -119,48 +119,48 @@ class Node:
             core=core,
             watchdog=watchdog,
         )
-        # Mangled names: a driver class that calls its own things `connect`, `log`
-        # or `_inputs` must not take the machinery apart.
-        self.__core = NodeCore(
+        # Names that nobody else uses: a driver class that calls its own things
+        # `connect`, `log` or `_inputs` must not take the machinery apart.
+        self._horus_core = NodeCore(
             self, spec, callbacks, declared("pubs", pubs, Pub), declared("subs", subs, Sub)
         )
-        self.__outputs = self.__core.outputs
-        self.__inputs = self.__core.inputs
-        self.__warned_outside = False
+        self._horus_outputs = self._horus_core.outputs
+        self._horus_inputs = self._horus_core.inputs
+        self._horus_warned = False
 
     # -- configuration, as the contract names it -------------------------------
 
     @property
     def name(self) -> str:
         """The name."""
-        return self.__core.spec.name
+        return self._horus_core.spec.name
 
     @property
     def rate(self) -> float:
         """The rate [Hz]; 30 when not given."""
-        return self.__core.spec.rate_hz
+        return self._horus_core.spec.rate_hz
 
     @property
     def order(self) -> int:
         """The execution order; 100 when not given."""
-        return self.__core.spec.order
+        return self._horus_core.spec.order
 
     @property
     def budget(self) -> float | None:
         """The budget [s], given or derived."""
-        budget_ns = self.__core.spec.budget_ns
+        budget_ns = self._horus_core.spec.budget_ns
         return None if budget_ns is None else to_s(budget_ns)
 
     @property
     def deadline(self) -> float | None:
         """The deadline [s], given or derived."""
-        deadline_ns = self.__core.spec.deadline_ns
+        deadline_ns = self._horus_core.spec.deadline_ns
         return None if deadline_ns is None else to_s(deadline_ns)
 
     @property
     def execution_class(self) -> ExecutionClass:
         """The execution class that the configuration implies."""
-        return self.__core.spec.execution_class
+        return self._horus_core.spec.execution_class
 
     # -- messages ---------------------------------------------------------------
 
@@ -174,9 +174,9 @@ class Node:
         Thread: the node's own callbacks.
         """
         try:
-            publisher = self.__outputs[topic]
+            publisher = self._horus_outputs[topic]
         except KeyError:
-            publisher = self.__core.open_output(topic)
+            publisher = self._horus_core.open_output(topic)
         publisher.send(message)
 
     def recv(self, topic: str | type) -> Any:
@@ -185,25 +185,25 @@ class Node:
         Thread: the node's own callbacks.
         """
         try:
-            subscription = self.__inputs[topic]
+            subscription = self._horus_inputs[topic]
         except KeyError:
-            subscription = self.__core.open_input(topic)
+            subscription = self._horus_core.open_input(topic)
         return subscription.take()
 
     def recv_all(self, topic: str | type) -> list[Any]:
         """Return every message that waits, oldest first."""
-        return self.__input(topic).take_all()
+        return self._horus_input(topic).take_all()
 
     def has_msg(self, topic: str | type) -> bool:
         """Return whether a message waits."""
         try:
-            return bool(self.__inputs[topic].queue)
+            return bool(self._horus_inputs[topic].queue)
         except KeyError:
-            return bool(self.__core.open_input(topic).queue)
+            return bool(self._horus_core.open_input(topic).queue)
 
     def latest(self, topic: str | type) -> Any:
         """Return the topic's newest message, received or not; None before the first."""
-        return self.__input(topic).topic.latest()
+        return self._horus_input(topic).topic.latest()
 
     # -- control and logging ----------------------------------------------------
 
@@ -212,36 +212,36 @@ class Node:
 
         Thread: any.
         """
-        request_stop = self.__core.request_stop
+        request_stop = self._horus_core.request_stop
         if request_stop is None:
             raise StateError(f"node {self.name!r} was not added to a scheduler")
         request_stop(reason or f"requested by node {self.name!r}")
 
     def log_debug(self, message: str, *args: object) -> None:
         """Log at debug level to `horus.node.<name>`; dropped outside callbacks."""
-        self.__emit(logging.DEBUG, message, args)
+        self._horus_emit(logging.DEBUG, message, args)
 
     def log_info(self, message: str, *args: object) -> None:
         """Log at info level; see `log_debug`."""
-        self.__emit(logging.INFO, message, args)
+        self._horus_emit(logging.INFO, message, args)
 
     def log_warning(self, message: str, *args: object) -> None:
         """Log at warning level; see `log_debug`."""
-        self.__emit(logging.WARNING, message, args)
+        self._horus_emit(logging.WARNING, message, args)
 
     def log_error(self, message: str, *args: object) -> None:
         """Log at error level; see `log_debug`."""
-        self.__emit(logging.ERROR, message, args)
+        self._horus_emit(logging.ERROR, message, args)
 
     def __repr__(self) -> str:
         """Show what the node is and how it is scheduled."""
-        spec = self.__core.spec
+        spec = self._horus_core.spec
         when = f"on={spec.on!r}" if spec.on else f"rate={spec.rate_hz:g}"
         return f"<Node {spec.name!r} {spec.execution_class} {when} order={spec.order}>"
 
     # -- internals ----------------------------------------------------------------
 
-    def __pick(
+    def _horus_pick(
         self, argument: str, function: Callback | None, method: str | None = None
     ) -> Callback | None:
         """Return a callback from the argument or the method of the class, not both."""
@@ -254,15 +254,15 @@ class Node:
         bound: Callback = getattr(self, method or argument)
         return bound
 
-    def __input(self, topic: str | type) -> Subscription:
-        return self.__inputs.get(topic) or self.__core.open_input(topic)
+    def _horus_input(self, topic: str | type) -> Subscription:
+        return self._horus_inputs.get(topic) or self._horus_core.open_input(topic)
 
-    def __emit(self, level: int, message: str, args: tuple[object, ...]) -> None:
+    def _horus_emit(self, level: int, message: str, args: tuple[object, ...]) -> None:
         context = clock.current.get()
-        log = self.__core.log
+        log = self._horus_core.log
         if context is None:
-            if not self.__warned_outside:
-                self.__warned_outside = True
+            if not self._horus_warned:
+                self._horus_warned = True
                 _log.warning(
                     "%s logs outside init, tick and shutdown; such messages are dropped "
                     "(this is said once): %s",
@@ -272,11 +272,6 @@ class Node:
         elif log.isEnabledFor(level):
             extra = {"node": self.name, "cycle": context.cycle()}
             log.log(level, message, *args, extra=extra, stacklevel=3)
-
-    @staticmethod
-    def _core_of(node: Node) -> NodeCore | None:
-        """Return what the scheduler knows of a node; None if it was never initialised."""
-        return getattr(node, "_Node__core", None)
 
 
 class NodeCore:
@@ -390,8 +385,8 @@ def core_of(node: object) -> NodeCore:
     Raises:
         ConfigError: Not a node, or a subclass that did not call `super().__init__()`.
     """
-    core = Node._core_of(node) if isinstance(node, Node) else None
-    if core is None:
+    core = getattr(node, "_horus_core", None) if isinstance(node, Node) else None
+    if not isinstance(core, NodeCore):
         raise ConfigError(
             "node", node, "must be a Node; a subclass must call super().__init__(name, ...)"
         )

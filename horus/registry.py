@@ -89,7 +89,7 @@ class Registry:
             return None
         if isinstance(names, str) or not isinstance(names, Iterable):
             raise ConfigError("names", names, _names_remedy(names))
-        return [self.get(name) for name in dict.fromkeys(names)]
+        return list(dict.fromkeys(self.get(name) for name in names))
 
     def names(self) -> list[str]:
         """Return the names in execution order."""

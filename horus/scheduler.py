@@ -18,7 +18,7 @@ from horus.spec import make_scheduler_spec
 from horus.stats import TimingReport
 from horus.stream import MessageStream
 from horus.topics import Publisher
-from horus.validation import check_duration, optional_duration
+from horus.validation import check_duration, check_topic, optional_duration
 
 _APPLICATION = "application"
 
@@ -118,9 +118,10 @@ class Scheduler:
     def remove_node(self, name: str) -> bool:
         """Shut a node down and remove it; return whether it existed.
 
-        `shutdown()` has run when this returns. Two cases must end first to begin
-        it: a node that removes itself, and an async node removed from a callback
-        on the event loop. They are shut down as soon as their tick has ended.
+        `shutdown()` has run when this returns, except for a node that removes
+        itself and for an async node removed by a callback on the event loop: they
+        are shut down as soon as their tick has ended. While the whole run shuts
+        down, the node has its turn there.
 
         Raises:
             ShutdownTimeout: The node's tick or `shutdown()` did not end in time.
@@ -128,9 +129,8 @@ class Scheduler:
         live = self._registry.remove(name)
         if live is None:
             return False
-        self._session.leave(live)
-        live.core.disconnect()
         live.core.owner = None
+        self._session.leave(live)
         return True
 
     def set_node_rate(self, name: str, rate: float) -> None:
@@ -272,7 +272,11 @@ class Scheduler:
     async def __aenter__(self) -> Self:
         """Start running in the background of the event loop."""
         self._background = asyncio.ensure_future(self.arun())
-        await asyncio.sleep(0)
+        try:
+            await asyncio.sleep(0)
+        except BaseException:
+            await self.__aexit__(None, None, None)
+            raise
         return self
 
     async def __aexit__(
@@ -295,6 +299,8 @@ class Scheduler:
         Raises:
             TopicError: The topic or the message was refused.
         """
+        if not isinstance(topic, str | type):
+            check_topic(topic)
         with self._publish_lock:
             publisher = self._publishers.get(topic)
             if publisher is None:

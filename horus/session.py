@@ -181,6 +181,8 @@ class Session:
             self._wait_for(live, self._runtime)
         if self._stepper is not None:
             self._stepper.remove(live)
+        if not live.initialized and not live.ticking:
+            live.core.disconnect()
 
     def open_stream(self, subscription: Subscription) -> MessageStream:
         """Return a stream that ends with the session."""

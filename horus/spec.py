@@ -169,7 +169,7 @@ def make_node_spec(
         raise ConfigError("order", order, "must be a whole number >= 0; lower runs earlier")
     spec = NodeSpec(
         name=checked_name,
-        order=order,
+        order=int(order),
         rate_hz=DEFAULT_RATE_HZ if rate is None else check_rate(rate),
         rate_given=rate is not None,
         budget_ns=optional_duration("budget", budget),

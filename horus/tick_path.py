@@ -22,7 +22,7 @@ from typing import Any
 
 from horus.errors import NodeError
 from horus.escalation import Action, Outcome, decide
-from horus.live import Admission, LiveNode, being_cancelled, never_awaited
+from horus.live import Admission, Limits, LiveNode, being_cancelled, never_awaited
 
 RunTick = Callable[[int], None]
 RunTickAsync = Callable[[int], Coroutine[Any, Any, None]]
@@ -44,6 +44,7 @@ def build_tick(live: LiveNode) -> RunTick:
         context.previous_ns = context.start_ns
         context.start_ns = start_ns = now_ns()
         context.ticking = True
+        limits = live.limits
         error: BaseException | None = None
         try:
             result = run_in_context(callback)
@@ -55,7 +56,7 @@ def build_tick(live: LiveNode) -> RunTick:
                 live.control.request_stop("KeyboardInterrupt")
                 raise
             error = exc
-        if finish(release_ns, start_ns, error):
+        if finish(release_ns, start_ns, limits, error):
             live.run_phase("safe_state")
         # The exception's traceback refers to this frame: let go of it, or each
         # failed tick leaves a cycle to the garbage collector.
@@ -83,6 +84,7 @@ def build_async_tick(live: LiveNode) -> RunTickAsync:
         context.previous_ns = context.start_ns
         context.start_ns = start_ns = now_ns()
         context.ticking = True
+        limits = live.limits
         error: BaseException | None = None
         try:
             await callback()
@@ -96,21 +98,21 @@ def build_async_tick(live: LiveNode) -> RunTickAsync:
                 live.control.request_stop("KeyboardInterrupt")
                 raise
             error = exc
-        if finish(release_ns, start_ns, error):
+        if finish(release_ns, start_ns, limits, error):
             await live.run_phase_async("safe_state")
         error = None
 
     return run_tick
 
 
-def _build_finish(live: LiveNode) -> Callable[[int, int, BaseException | None], bool]:
+def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException | None], bool]:
     """Return steps 4 and 5, which tell whether the safe-state hook is to be called."""
     now_ns = live.timeline.now_ns
     context = live.tick_context
     counters = live.counters
     add_times = counters.times.add
 
-    def finish(release_ns: int, start_ns: int, error: BaseException | None) -> bool:
+    def finish(release_ns: int, start_ns: int, limits: Limits, error: BaseException | None) -> bool:
         finish_ns = now_ns()
         execution_ns = finish_ns - start_ns
         counters.ticks += 1
@@ -118,10 +120,10 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, BaseException | None], 
             counters.first_release_ns = release_ns
         counters.last_release_ns = release_ns
         add_times(execution_ns, start_ns - release_ns)
-        over_budget_ns = execution_ns - live.budget_ns
-        past_deadline_ns = finish_ns - release_ns - live.deadline_ns
+        over_budget_ns = execution_ns - limits[0]
+        past_deadline_ns = finish_ns - release_ns - limits[1]
         if over_budget_ns > 0 or past_deadline_ns > 0 or error is not None or live.in_episode:
-            enter_safe_state = _settle(live, over_budget_ns, past_deadline_ns, error)
+            enter_safe_state = _settle(live, limits, over_budget_ns, past_deadline_ns, error)
             context.ticking = False
             return enter_safe_state
         context.ticking = False
@@ -131,7 +133,11 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, BaseException | None], 
 
 
 def _settle(
-    live: LiveNode, over_budget_ns: int, past_deadline_ns: int, error: BaseException | None
+    live: LiveNode,
+    limits: Limits,
+    over_budget_ns: int,
+    past_deadline_ns: int,
+    error: BaseException | None,
 ) -> bool:
     """Count what went wrong, decide what follows and do it; see `_build_finish`."""
     counters = live.counters
@@ -150,13 +156,15 @@ def _settle(
     if outcome.past_deadline_ns:
         counters.deadline_misses += 1
         live.control.count_miss()
-    _act(live, outcome, action, error)
+    _act(live, limits, outcome, action, error)
     return action.enter_safe_state
 
 
-def _act(live: LiveNode, outcome: Outcome, action: Action, error: BaseException | None) -> None:
+def _act(
+    live: LiveNode, limits: Limits, outcome: Outcome, action: Action, error: BaseException | None
+) -> None:
     if action.warn:
-        text = live.limit_exceeded(outcome.over_budget_ns, outcome.past_deadline_ns)
+        text = live.limit_exceeded(limits, outcome.over_budget_ns, outcome.past_deadline_ns)
         if action.stop:
             live.control.request_stop(f"node {live.name!r} {text}")
     if action.skip_next:

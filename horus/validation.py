@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import numbers
 import os
 import re
 from collections.abc import Iterable
 from enum import StrEnum
 from typing import Any, TypeGuard, TypeVar
 
-from horus.errors import ConfigError, TopicError
+from horus.errors import ConfigError, TopicError, describe
 from horus.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 E = TypeVar("E", bound=StrEnum)
@@ -45,7 +46,7 @@ def check_topic(value: Any) -> str:
     name = value.__name__ if isinstance(value, type) else value
     if not isinstance(name, str) or not _NAME.fullmatch(name) or ".." in name:
         raise TopicError(
-            f"topic {value!r}: must be 1 to 128 ASCII letters, digits, '_', '-' or '.', "
+            f"topic {describe(value)}: must be 1 to 128 ASCII letters, digits, '_', '-' or '.', "
             "e.g. 'front.scan'; path separators and control characters are refused"
         )
     return name
@@ -101,7 +102,7 @@ def check_core(argument: str, value: object) -> int:
         raise ConfigError(argument, value, "must be a core index >= 0")
     if value >= count:
         raise ConfigError(argument, value, f"this machine has {count} cores, 0 to {count - 1}")
-    return value
+    return int(value)
 
 
 def check_priority(value: object) -> int | None:
@@ -110,7 +111,7 @@ def check_priority(value: object) -> int | None:
         return None
     if not is_int(value) or not 1 <= value <= 99:
         raise ConfigError("priority", value, "must be a SCHED_FIFO priority from 1 to 99")
-    return value
+    return int(value)
 
 
 def check_compute(value: object) -> bool:
@@ -132,20 +133,20 @@ def check_compute(value: object) -> bool:
 def member(kind: type[E], argument: str, value: object) -> E:
     """Return the member of an enumeration that a string names; refuse others."""
     try:
-        return kind(str(value))
+        return kind(value if isinstance(value, str) else "")
     except ValueError:
         names = ", ".join(repr(member.value) for member in kind)
         raise ConfigError(argument, value, f"must be one of {names}") from None
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Return whether `value` is an int or a float; a bool is neither."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    """Return whether `value` is a real number, also one of NumPy's; a bool is not."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
 def is_int(value: object) -> TypeGuard[int]:
-    """Return whether `value` is an int; a bool is not."""
-    return isinstance(value, int) and not isinstance(value, bool)
+    """Return whether `value` is a whole number, also one of NumPy's; a bool is not."""
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 
 def check_flag(argument: str, value: object) -> bool:
@@ -159,7 +160,7 @@ def check_count(argument: str, value: object, least: int = 0) -> int:
     """Return a whole number of at least `least`."""
     if not is_int(value) or value < least:
         raise ConfigError(argument, value, f"must be a whole number >= {least}")
-    return value
+    return int(value)
 
 
 def check_cores(value: object) -> tuple[int, ...] | None:

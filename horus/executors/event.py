@@ -2,19 +2,155 @@
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from concurrent.futures import Future
 
 from horus.executors.async_io import TaskRunner
 from horus.executors.base import LoopExecutor
+from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import EventTick, LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
+from horus.loop.executor import Executor
 from horus.tick_path import RunTick, build_tick
 from horus.units import to_s
 
 
-class EventExecutor(LoopExecutor):
+class EventExecutor:
+    """Sends each node to the event loop, or to a thread of its own if it is urgent.
+
+    Urgent is a plain node with a priority, a budget or a deadline: an emergency
+    stop must not wait behind a logger that blocks the loop.
+    """
+
+    def __init__(self, bridge: Bridge, cycle: Cycle) -> None:
+        """Serve the nodes of one run."""
+        self._on_loop = LoopEventExecutor(bridge, cycle)
+        self._on_threads = ThreadEventExecutor()
+
+    def adopt(self, live: LiveNode) -> None:
+        """Give the node its home."""
+        self._home_of(live).adopt(live)
+
+    def engage(self, live: LiveNode, from_ns: int) -> None:
+        """Listen to the trigger topic, starting with what has arrived already."""
+        self._home_of(live).engage(live, from_ns)
+
+    def disengage(self, live: LiveNode) -> None:
+        """Stop listening."""
+        self._home_of(live).disengage(live)
+
+    def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
+        """Run a callback in the node's home."""
+        return self._home_of(live).call(live, phase)
+
+    def retime(self, live: LiveNode) -> None:
+        """Do nothing: messages release the node."""
+
+    def is_home(self, live: LiveNode) -> bool:
+        """Return whether the calling thread is the node's home."""
+        return self._home_of(live).is_home(live)
+
+    def dismiss(self, live: LiveNode) -> None:
+        """Take the home away."""
+        self._home_of(live).dismiss(live)
+
+    def _home_of(self, live: LiveNode) -> Executor:
+        spec = live.spec
+        # As the node was configured: a budget set later does not move it.
+        urgent = spec.priority is not None or live.core.spec.budget_given
+        urgent = urgent or live.core.spec.deadline_given
+        return self._on_threads if urgent and not live.is_async else self._on_loop
+
+
+class Arrivals:
+    """When each message arrived that waits: the release of its tick.
+
+    Thread: `add` on the senders', the rest where the node ticks.
+    """
+
+    def __init__(self, live: LiveNode) -> None:
+        """Begin with no messages."""
+        assert live.trigger is not None
+        self.trigger = live.trigger
+        self._now_ns = live.timeline.now_ns
+        self._instants: deque[int] = deque(maxlen=live.trigger.capacity)
+
+    def add(self) -> None:
+        """Take note that a message has arrived."""
+        self._instants.append(self._now_ns())
+
+    def next_release_ns(self) -> int:
+        """Return the arrival of the message whose turn it is [ns]."""
+        # A message may be queued and not yet noted: its sender is between the two.
+        return self._instants[0] if self._instants else self._now_ns()
+
+    def forget_used(self) -> None:
+        """Get in step with the queue after a tick."""
+        while len(self._instants) > len(self.trigger.queue):
+            self._instants.popleft()
+
+
+class EventThread(NodeThread):
+    """Sleeps until a message arrives, and ticks."""
+
+    def __init__(self, live: LiveNode) -> None:
+        """Prepare a thread that does not listen yet."""
+        super().__init__(live)
+        self.engaged = False
+        self.arrivals = Arrivals(live)
+        self._run_tick = build_tick(live)
+
+    def wake(self) -> None:
+        """Take note of a message. Thread: any."""
+        self.arrivals.add()
+        self.unpark()
+
+    def idle(self) -> None:
+        """Wait for a message and tick for it."""
+        arrivals = self.arrivals
+        if not self.engaged or not arrivals.trigger.queue:
+            self.park()
+            return
+        delay_ns = self.live.resume_after_ns()
+        if delay_ns:
+            # Restarting: the messages wait, and are not lost to the back-off.
+            self.park(delay_ns)
+            return
+        before = EventTick(self.live)
+        self._run_tick(arrivals.next_release_ns())
+        before.settle()
+        arrivals.forget_used()
+
+
+class ThreadEventExecutor(ThreadExecutor[EventThread]):
+    """Gives every node an `EventThread`."""
+
+    def make_thread(self, live: LiveNode) -> EventThread:
+        """Return the node's thread, not started."""
+        return EventThread(live)
+
+    def engage(self, live: LiveNode, from_ns: int) -> None:
+        """Listen to the trigger topic, starting with what has arrived already."""
+        live.enter_service()
+        thread = self.thread_of(live)
+        thread.arrivals.trigger.wake = thread.wake
+        thread.post(functools.partial(setattr, thread, "engaged", True))
+
+    def disengage(self, live: LiveNode) -> None:
+        """Stop listening; a tick in progress goes on."""
+        live.leave_service()
+        thread = self.thread_of(live)
+        thread.arrivals.trigger.wake = None
+        thread.engaged = False
+        thread.unpark()
+
+    def retime(self, live: LiveNode) -> None:
+        """Do nothing: messages release the node."""
+
+
+class LoopEventExecutor(LoopExecutor):
     """Wakes a node when its trigger topic receives a message."""
 
     def __init__(self, bridge: Bridge, cycle: Cycle) -> None:
@@ -63,30 +199,25 @@ class _EventRunner:
     def __init__(
         self, live: LiveNode, bridge: Bridge, run_tick: RunTick | None, tasks: TaskRunner
     ) -> None:
-        trigger = live.trigger
-        assert trigger is not None
         self._live = live
-        self._trigger = trigger
+        self._arrivals = Arrivals(live)
+        self._trigger = self._arrivals.trigger
         self._bridge = bridge
         self._run_tick = run_tick
         self._tasks = tasks
         self._scheduled = False
-        self._now_ns = live.timeline.now_ns
-        # When each waiting message arrived: its tick's release. In step with the
-        # queue, and as bounded.
-        self._arrivals: deque[int] = deque(maxlen=trigger.capacity)
 
     def listen(self) -> None:
         self._trigger.wake = self.wake
         if self._trigger.queue:
-            self.wake()
+            self._schedule()
 
     def ignore(self) -> None:
         self._trigger.wake = None
 
     def wake(self) -> None:
         """Take note of a message. Thread: any."""
-        self._arrivals.append(self._now_ns())
+        self._arrivals.add()
         self._schedule()
 
     def _schedule(self) -> None:
@@ -109,18 +240,22 @@ class _EventRunner:
             self._scheduled = True
             self._bridge.loop.call_later(to_s(delay_ns), self._step)
             return
-        release_ns = self._arrivals[0] if self._arrivals else self._now_ns()
+        release_ns = self._arrivals.next_release_ns()
         before = EventTick(live)
         if self._run_tick is None:
             task = self._tasks.start(live, release_ns)
             task.add_done_callback(lambda _: self._ticked(before))
         else:
-            self._run_tick(release_ns)
+            try:
+                self._run_tick(release_ns)
+            except KeyboardInterrupt:
+                raise
+            except BaseException as exc:
+                live.broken(exc)
             self._ticked(before)
 
     def _ticked(self, before: EventTick) -> None:
         before.settle()
-        while len(self._arrivals) > len(self._trigger.queue):
-            self._arrivals.popleft()
+        self._arrivals.forget_used()
         if self._trigger.queue and not self._live.retired:
             self._schedule()

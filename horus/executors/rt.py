@@ -56,9 +56,9 @@ class RtThread(NodeThread):
         self.engaged = True
 
     def retime(self) -> None:
-        """Move to the grid of the node's new rate."""
-        last_ns = self.live.tick_context.release_ns
-        self._join_grid(max(self._now_ns(), last_ns + 1))
+        """Move to the grid of the node's new rate; a release that is due is not lost to it."""
+        if self._grid != self.live.grid():
+            self._join_grid(min(self._release_ns, self._now_ns()))
 
     def _join_grid(self, from_ns: int) -> None:
         self._grid = self.live.grid()

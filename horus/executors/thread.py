@@ -9,7 +9,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Generic, TypeVar
 
-from horus.errors import NodeError
 from horus.executors.base import run_into
 from horus.live import LiveNode
 from horus.units import to_s
@@ -70,12 +69,7 @@ class NodeThread(threading.Thread):
         self._parked.acquire(True, -1 if timeout_ns is None else to_s(timeout_ns))
 
     def run(self) -> None:
-        """Serve until closed.
-
-        Nothing of a node's can get here: the tick path and `run_phase` hold on to
-        what callbacks raise. If something does all the same, the run ends, and the
-        thread goes on to serve `shutdown()`: a dead home must not look healthy.
-        """
+        """Serve until closed, whatever happens: `shutdown()` is to run here, too."""
         while not self._closing or self._jobs:
             try:
                 if self._jobs:
@@ -83,10 +77,7 @@ class NodeThread(threading.Thread):
                 else:
                     self.idle()
             except BaseException as exc:
-                self.live.leave_service()
-                failure = NodeError(self.live.name, "tick", exc)
-                failure.__cause__ = exc
-                self.live.control.fail(failure)
+                self.live.broken(exc)
                 self.idle = self.park  # type: ignore[method-assign]
 
     def idle(self) -> None:

@@ -46,11 +46,14 @@ class Bridge:
             self.post(call)
 
     def post(self, call: Callable[[], object]) -> None:
-        """Run `call` on the loop's thread soon; after `close` it is dropped.
+        """Run `call` on the loop's thread soon; after `close`, here and now.
 
         Thread: any.
         """
         self._calls.append(call)
+        if self._closed:
+            self._drain()
+            return
         # Append first, then look: the reader clears the flag before it drains,
         # so a call is either seen by the drain or writes a wake-up of its own.
         if not self._awake:

@@ -44,7 +44,12 @@ class Cycle:
         now_ns = min(self._now_ns(), self._timeline.end_ns - 1)
         while (due := self._releases.pop_due(now_ns)) is not None:
             live, release_ns = due
-            self._dispatch[live](live, release_ns)
+            try:
+                self._dispatch[live](live, release_ns)
+            except KeyboardInterrupt:
+                raise
+            except BaseException as exc:
+                live.broken(exc)
         self._arm()
 
     def add(self, live: LiveNode, dispatch: Dispatch, from_ns: int) -> None:

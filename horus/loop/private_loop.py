@@ -121,13 +121,19 @@ class VirtualLoop(StepLoop):
         self._clock = clock
         self._next_timer_ns: int | None = None
         self._selector = _IdleSelector()
-        super().__init__(_SimulatedLoop(clock, self._selector))
+        self._simulated = _SimulatedLoop(clock, self._selector)
+        super().__init__(self._simulated)
         self._selector.attach(self.loop)
 
     @property
     def next_timer_ns(self) -> int | None:
         """The instant of the earliest timer [ns]; None when nothing waits for time."""
         return self._next_timer_ns
+
+    @property
+    def has_work(self) -> bool:
+        """Whether something could go on without time passing."""
+        return self._simulated.has_ready
 
     def settle(self) -> None:
         """Run until nothing can go on without time passing."""
@@ -166,6 +172,10 @@ class _SimulatedLoop(asyncio.SelectorEventLoop):
     def __init__(self, clock: SimClock, selector: selectors.BaseSelector) -> None:
         self._simulated = clock
         super().__init__(selector)
+
+    @property
+    def has_ready(self) -> bool:
+        return bool(self._ready)  # type: ignore[attr-defined]
 
     def time(self) -> float:
         return to_s(self._simulated.now_ns())

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from horus import clock
 from horus.live import LiveNode
@@ -13,18 +14,17 @@ from horus.timing import ReleaseGrid
 Rank = tuple[int, int]
 
 
-@dataclass(slots=True, order=True)
+@dataclass(slots=True)
 class _Release:
-    """The next release of a node; compares by instant, then execution order."""
+    """The next release of a node."""
 
-    at_ns: int
+    live: LiveNode
+    grid: ReleaseGrid
     rank: Rank
-    index: int = field(compare=False)
-    grid: ReleaseGrid = field(compare=False)
-    live: LiveNode = field(compare=False)
-    last_ns: int = field(compare=False, default=clock.NEVER)
+    index: int
+    last_ns: int
     """The release that was handed out last [ns]."""
-    cancelled: bool = field(compare=False, default=False)
+    cancelled: bool = False
 
 
 class ReleaseQueue:
@@ -35,24 +35,26 @@ class ReleaseQueue:
 
     def __init__(self) -> None:
         """Begin with no nodes."""
-        self._heap: list[_Release] = []
+        # Tuples, which the heap compares in C. The serial number keeps it from
+        # ever comparing two releases.
+        self._heap: list[tuple[int, Rank, int, _Release]] = []
         self._of_node: dict[LiveNode, _Release] = {}
+        self._serial = itertools.count()
 
     @property
     def next_ns(self) -> int | None:
         """The instant of the earliest release [ns]; None without nodes."""
-        while self._heap and self._heap[0].cancelled:
+        while self._heap and self._heap[0][3].cancelled:
             heapq.heappop(self._heap)
-        return self._heap[0].at_ns if self._heap else None
+        return self._heap[0][0] if self._heap else None
 
     def add(self, live: LiveNode, rank: Rank, from_ns: int, last_ns: int = clock.NEVER) -> None:
         """Queue the first release of `live` at or after `from_ns`, and after `last_ns` [ns]."""
         self.remove(live)
         grid = live.grid()
         index = grid.first_from(max(from_ns, last_ns + 1))
-        release = _Release(grid.at(index), rank, index, grid, live, last_ns)
-        self._of_node[live] = release
-        heapq.heappush(self._heap, release)
+        release = self._of_node[live] = _Release(live, grid, rank, index, last_ns)
+        heapq.heappush(self._heap, (grid.at(index), rank, next(self._serial), release))
 
     def remove(self, live: LiveNode) -> None:
         """Forget `live`; unknown nodes are ignored."""
@@ -61,17 +63,22 @@ class ReleaseQueue:
             release.cancelled = True
 
     def retime(self, live: LiveNode, now_ns: int) -> None:
-        """Move `live` to the grid of its present rate; unknown nodes are ignored."""
+        """Move `live` to the grid of its present rate; unknown nodes are ignored.
+
+        A release of the old grid that is due already is not lost to the change.
+        """
         release = self._of_node.get(live)
-        if release is not None:
-            self.remove(live)
-            self.add(live, release.rank, now_ns, release.last_ns)
+        if release is not None and release.grid != live.grid():
+            due_ns = release.grid.at(release.index)
+            self.add(live, release.rank, min(due_ns, now_ns), release.last_ns)
 
     def rerank(self, ranks: Mapping[LiveNode, Rank]) -> None:
         """Give every node a new place in execution order."""
+        self._heap = []
         for live, release in self._of_node.items():
             release.rank = ranks[live]
-        heapq.heapify(self._heap)
+            entry = (release.grid.at(release.index), release.rank, next(self._serial), release)
+            heapq.heappush(self._heap, entry)
 
     def pop_due(self, now_ns: int) -> tuple[LiveNode, int] | None:
         """Return the earliest node that is due, and the instant of its release [ns].
@@ -82,14 +89,17 @@ class ReleaseQueue:
         next_ns = self.next_ns
         if next_ns is None or next_ns > now_ns:
             return None
-        release = self._heap[0]
-        latest = release.grid.index_at(now_ns)
-        release.live.counters.skipped += latest - release.index
-        release_ns = release.grid.at(latest)
+        release_ns, rank, serial, release = self._heap[0]
+        grid = release.grid
+        following_ns = grid.at(release.index + 1)
+        if following_ns <= now_ns:
+            latest = grid.index_at(now_ns)
+            release.live.counters.skipped += latest - release.index
+            release.index = latest
+            release_ns, following_ns = grid.at(latest), grid.at(latest + 1)
+        release.index += 1
         release.last_ns = release_ns
-        release.index = latest + 1
-        release.at_ns = release.grid.at(latest + 1)
-        heapq.heapreplace(self._heap, release)
+        heapq.heapreplace(self._heap, (following_ns, rank, serial, release))
         return release.live, release_ns
 
     def clear(self) -> None:

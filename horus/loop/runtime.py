@@ -58,11 +58,12 @@ class Runtime:
         self._joining: deque[LiveNode] = deque()
         self._playing = False
         self._closing = False
-        self._stop_requested = threading.Event()
+        self._stop_requested = False
         self._reacted = threading.Event()
         self._stop_event = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._lock = threading.Lock()
+        # Re-entrant: a signal handler that stops the run may interrupt `_post`.
+        self._lock = threading.RLock()
         self._bridge: Bridge | None = None
         self._over = False
         self._notes: deque[Callable[[], None]] = deque()
@@ -106,9 +107,9 @@ class Runtime:
 
         Thread: any, also a signal handler.
         """
-        if self._stop_requested.is_set():
+        if self._stop_requested:
             return
-        self._stop_requested.set()
+        self._stop_requested = True
         for live in tuple(self._homes):
             # At once, not when the loop gets to it: a tick that asks for a stop is
             # the last of its node.
@@ -127,7 +128,7 @@ class Runtime:
 
         Thread: any, while nothing runs.
         """
-        self._stop_requested.clear()
+        self._stop_requested = False
         self._reacted.clear()
         self._stop_event.clear()
 
@@ -169,8 +170,8 @@ class Runtime:
 
         Thread: any.
         """
-        home = self._executors[live.spec.execution_class]
-        return home.is_home(live)
+        home = self._homes.get(live)
+        return home is not None and home.is_home(live)
 
     def _post(self, note: Callable[[], None]) -> None:
         """Do something on the loop's thread: now if this is it, else soon.
@@ -213,7 +214,7 @@ class Runtime:
     async def _initialize(self, lives: Iterable[LiveNode]) -> None:
         """Call `init()` of each new node in order; one that fails is left out, others go on."""
         self._joining.extend(sorted(lives, key=lambda live: live.rank))
-        while self._joining and not self._stop_requested.is_set():
+        while self._joining and not self._stop_requested:
             # Nodes that are added by an init() come after those that were there.
             await self._adopt(self._joining.popleft())
 
@@ -243,7 +244,7 @@ class Runtime:
                 self._engage_one(live, self._timeline.epoch_ns)
 
     def _engage_one(self, live: LiveNode, from_ns: int) -> None:
-        if live.initialized and not live.removed and not self._stop_requested.is_set():
+        if live.initialized and not live.removed and not self._stop_requested:
             self._homes[live].engage(live, from_ns)
 
     async def _until_stopped(self) -> None:
@@ -261,7 +262,7 @@ class Runtime:
         """Let a node that was added take part: in this run, or in the next."""
         if not self._playing:
             self._joining.append(live)
-        elif not self._stop_requested.is_set():
+        elif not self._stop_requested:
             self._spawn(self._bring_up(live))
 
     async def _bring_up(self, live: LiveNode) -> None:

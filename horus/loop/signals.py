@@ -10,10 +10,12 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from horus import logs
-
 _log = logging.getLogger("horus.scheduler")
 _OWNED = (signal.SIGINT, signal.SIGTERM)
+
+
+_LAST_WORDS_S = 0.3
+"""How long the log may take to reach the terminal before the process ends [s]."""
 
 
 @contextlib.contextmanager
@@ -34,9 +36,7 @@ def stop_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
 
     def handle(number: int, frame: FrameType | None) -> None:
         if received:
-            _log.critical("%s again: exiting at once", signal.Signals(number).name)
-            logs.flush()
-            os._exit(128 + number)
+            _force_exit(number)
         received.append(number)
         stop(f"received {signal.Signals(number).name}")
 
@@ -48,3 +48,15 @@ def stop_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
             # None: installed from C, out of Python's reach to put back.
             if handler is not None:
                 signal.signal(number, handler)
+
+
+def _force_exit(number: int) -> None:
+    """End the process, with what the log still has to say if that can be said."""
+    # First the end, which nothing below can hold up: stderr may block.
+    threading.Timer(_LAST_WORDS_S, os._exit, [128 + number]).start()
+    threading.Thread(
+        target=_log.critical,
+        args=("%s again: exiting at once", signal.Signals(number).name),
+        daemon=True,
+    ).start()
+    threading.Event().wait()

@@ -183,6 +183,9 @@ class Simulation(Stepper):
     def _release(self, live: LiveNode, release_ns: int) -> None:
         if not live.is_async:
             self.tick(live, release_ns)
+            if self._virtual is not None and self._virtual.has_work:
+                # It woke an async tick: that goes on now, not at the next instant.
+                self._settle()
             return
         if live in self._in_flight:
             live.counters.skipped += 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import sys
 import threading
 import time
 
@@ -188,6 +189,36 @@ def test_a_real_time_release_grid_does_not_drift(make, loop):
         # Sleeping a period after each tick would give at most 41, not 50.
         done = counts[name] + sched.get_node_stats(name)["skipped"]
         assert done >= 45
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("kind", ["Rt", "Compute", "AsyncIo"])
+def test_a_late_start_does_not_lose_the_first_release(make, kind):
+    """A node that starts late ticks at once for the release it is late for, its first one too."""
+    seen = []
+    over = threading.Event()
+    sched = make(tick_rate=1)
+    sched.add(node_of(kind, "slow", record_ticks(seen, horus.tick), rate=0.2))
+
+    def hog():
+        while not over.is_set():
+            pass
+
+    interval = sys.getswitchinterval()
+    # A thread that wants to run waits for each of the others this long.
+    sys.setswitchinterval(0.01)
+    hogs = [threading.Thread(target=hog) for _ in range(3)]
+    try:
+        for thread in hogs:
+            thread.start()
+        run_until(sched, lambda: seen)
+    finally:
+        over.set()
+        for thread in hogs:
+            thread.join()
+        sys.setswitchinterval(interval)
+
+    assert seen[0] == 0
 
 
 def test_the_timer_measures_how_long_tick_took(make):
