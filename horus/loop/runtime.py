@@ -18,6 +18,7 @@ from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
 from horus.loop.executor import Executor
+from horus.loop.gil import prompt_switching
 from horus.loop.shutdown import begin_shutdown, quiesce, shut_down
 from horus.loop.supervisor import Supervisor, report_blocked_loop
 from horus.spec import ExecutionClass, NodeState
@@ -57,6 +58,7 @@ class Runtime:
         self._stuck: set[LiveNode] = set()
         self._joining: deque[LiveNode] = deque()
         self._playing = False
+        self._switches_promptly = False
         self._closing = False
         self._stop_requested = False
         self._reacted = threading.Event()
@@ -223,6 +225,9 @@ class Runtime:
             return
         home = self._executors[live.spec.execution_class]
         self._homes[live] = home
+        if live.spec.execution_class is ExecutionClass.RT and not self._switches_promptly:
+            self._resources.enter_context(prompt_switching())
+            self._switches_promptly = True
         home.adopt(live)
         if live.state is not NodeState.UNINITIALIZED:
             return
