@@ -38,6 +38,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import horus
 from agv import drive, mission, planner, safety, sensors
 from agv.devices import CameraNode, LidarNode
 from agv.fleet import FleetServer
@@ -46,8 +47,6 @@ from agv.layout import GOAL
 from agv.messages import MOUNTS, NEWEST_ODOM, NEWEST_SCANS, SCAN_TOPICS, Obstacles, Odometry
 from agv.telemetry import BatteryWatcher, FleetUploader
 from agv.world import MAX_STEPS_PER_TICK, TIMESTEP_S, World
-
-import horus
 from horus import Node, Scheduler, Sub, us
 
 if TYPE_CHECKING:

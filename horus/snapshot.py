@@ -69,6 +69,11 @@ _LONG_LIST = 16
 _MSGPACK_FLOAT64 = b"\xcb"
 _MSGPACK_FLOAT64_SIZE = 9
 _MAX_DEPTH = 8
+"""Nesting up to which messages are copied part by part."""
+
+_MAX_NESTING = 100
+"""Nesting beyond which a message is refused: a receiver deep in its own calls must cope, too."""
+
 _UNSENDABLE = (
     types.FunctionType,
     types.BuiltinFunctionType,
@@ -107,7 +112,7 @@ def freeze(value: Any, depth: int = 0) -> Frozen:
     if depth > _MAX_DEPTH:
         # deepcopy remembers what it has copied: a structure whose parts are
         # shared again and again would otherwise take time without end.
-        _refuse_cycles(value, set(), set())
+        _refuse_endless(value, set(), set())
         return _freeze_deep(value, depth)
     return (_freezers.get(kind) or _freezer_for(kind))(value, depth)
 
@@ -226,6 +231,12 @@ def _freeze_array(value: Any, depth: int) -> Frozen:
     return payload, type(payload).view
 
 
+def _refuse_array(value: Any, depth: int) -> Frozen:
+    raise UnsendableError(
+        f"a {type(value).__name__} may share more than its data; send numpy.asarray(x)"
+    )
+
+
 def _freeze_by_reference(value: Any, depth: int) -> Frozen:
     return value, None
 
@@ -278,23 +289,48 @@ def _thaw_fields(
 
 def _with_fields(instance: Any, fields: list[tuple[str, Any]]) -> Any:
     # Past the class's own __setattr__: frozen classes and validators refuse.
-    assign = msgspec.structs.force_setattr if isinstance(instance, msgspec.Struct) else _set
+    if isinstance(instance, msgspec.Struct):
+        for name, item in fields:
+            msgspec.structs.force_setattr(instance, name, item)
+        return instance
+    own = getattr(instance, "__dict__", {})
     for name, item in fields:
-        assign(instance, name, item)
+        if name in own:
+            own[name] = item
+        else:
+            object.__setattr__(instance, name, item)
     return instance
 
 
-_set = object.__setattr__
-
-
 def _copy_instance(slots: tuple[str, ...], value: Any) -> Any:
-    return _with_fields(object.__new__(type(value)), _attributes(slots, value))
+    fresh = object.__new__(type(value))
+    if hasattr(value, "__dict__"):
+        fresh.__dict__.update(value.__dict__)
+    return _with_fields(fresh, _held_in_slots(slots, value))
 
 
 def _attributes(slots: tuple[str, ...], value: Any) -> list[tuple[str, Any]]:
     """Return all that an instance holds, declared as a field or not."""
-    held = [(name, getattr(value, name)) for name in slots if hasattr(value, name)]
-    return [*getattr(value, "__dict__", {}).items(), *held]
+    return [*getattr(value, "__dict__", {}).items(), *_held_in_slots(slots, value)]
+
+
+def _held_in_slots(slots: tuple[str, ...], value: Any) -> list[tuple[str, Any]]:
+    return [(name, getattr(value, name)) for name in slots if hasattr(value, name)]
+
+
+def _slots_of(kind: type) -> tuple[str, ...]:
+    """Return the names of all slots of a class and its bases, as attributes."""
+    return tuple(
+        _mangled(base, name)
+        for base in kind.__mro__
+        for name in _as_tuple(base.__dict__.get("__slots__", ()))
+        if name not in ("__dict__", "__weakref__")
+    )
+
+
+def _mangled(kind: type, name: str) -> str:
+    private = name.startswith("__") and not name.endswith("__")
+    return f"_{kind.__name__.lstrip('_')}{name}" if private else name
 
 
 def _freeze_deep(value: Any, depth: int) -> Frozen:
@@ -306,15 +342,17 @@ def _freeze_deep(value: Any, depth: int) -> Frozen:
         raise UnsendableError(f"copying it failed with {type(exc).__name__}: {exc}") from exc
 
 
-def _refuse_cycles(value: Any, above: set[int], known: set[int]) -> None:
-    """Refuse a container that is inside itself."""
+def _refuse_endless(value: Any, above: set[int], known: set[int]) -> None:
+    """Refuse a container that is inside itself, or too deep."""
     if not isinstance(value, dict | list | tuple) or id(value) in known:
         return
     if id(value) in above:
         raise UnsendableError("it contains itself")
+    if len(above) >= _MAX_NESTING:
+        raise UnsendableError(f"it is nested more than {_MAX_NESTING} deep")
     above.add(id(value))
     for item in value.values() if isinstance(value, dict) else value:
-        _refuse_cycles(item, above, known)
+        _refuse_endless(item, above, known)
     above.remove(id(value))
     known.add(id(value))
 
@@ -345,6 +383,9 @@ def _choose(kind: type) -> Freezer:
     if numpy is not None:
         if kind is numpy.ndarray:
             return _freeze_array
+        if issubclass(kind, numpy.ndarray):
+            known = (numpy.memmap, numpy.recarray, numpy.ma.MaskedArray)
+            return _freeze_deep if kind in known else _refuse_array
         if issubclass(kind, numpy.generic) and not issubclass(kind, numpy.void):
             return _freeze_by_reference
     if issubclass(kind, enum.Enum):
@@ -356,14 +397,8 @@ def _choose(kind: type) -> Freezer:
     if issubclass(kind, msgspec.Struct):
         return functools.partial(_freeze_struct, bool(kind.__struct_config__.frozen))
     if dataclasses.is_dataclass(kind) and _is_plain(kind):
-        slots = tuple(
-            name
-            for base in kind.__mro__
-            for name in _as_tuple(base.__dict__.get("__slots__", ()))
-            if name not in ("__dict__", "__weakref__")
-        )
         frozen = bool(kind.__dataclass_params__.frozen)  # type: ignore[attr-defined]
-        return functools.partial(_freeze_instance, slots, frozen)
+        return functools.partial(_freeze_instance, _slots_of(kind), frozen)
     return _freeze_deep
 
 

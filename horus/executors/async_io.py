@@ -47,9 +47,12 @@ class TaskRunner:
         return task
 
     def cancel(self, live: LiveNode) -> None:
-        """Cancel the tick in progress, unless it is the one that calls."""
+        """Cancel the tick in progress, unless it is the one that calls.
+
+        A safe-state hook that the tick has led to is not cut short.
+        """
         task = self._ticks.get(live)
-        if task is not None and task is not _current_task():
+        if task is not None and live.ticking and task is not _current_task():
             task.cancel()
 
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import itertools
 import threading
 import time
@@ -391,6 +392,8 @@ def test_rng_float_is_seeded_by_node_and_tick(make):
 
 def test_outside_any_scheduler_the_functions_answer_sensibly_and_never_raise():
     """Outside callbacks: wall time, inf and so on, and never an exception."""
+    # Schedulers that earlier tests left unstopped are no longer anybody's.
+    gc.collect()
     answers = {}
 
     def ask():

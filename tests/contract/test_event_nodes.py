@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ import pytest
 import horus
 from horus import Node, Sub, ms
 
-from .helpers import node_of, nothing, run_until, running, wait_until
+from .helpers import PATIENCE_S, node_of, nothing, run_until, running, wait_until
 
 
 def test_on_makes_an_event_node():
@@ -212,6 +213,54 @@ def test_an_async_event_node_is_awaited_one_message_at_a_time(make, loop):
 
     assert received == list(range(6))
     assert overlaps == []
+
+
+@pytest.mark.realtime
+@pytest.mark.filterwarnings("ignore::horus.UnavailableWarning")
+@pytest.mark.parametrize("urgency", [{"priority": 90}, {"budget": 0.5}, {"deadline": 0.5}], ids=str)
+def test_an_urgent_event_node_is_never_behind_a_slow_logger(make, loop, urgency):
+    """Event node with priority, budget or deadline: a thread of its own, as for an e-stop."""
+    stopped = threading.Event()
+    in_time = []
+    sched = make(loop=loop)
+
+    def slow_log(node):
+        node.send("emergency.stop", True)
+        in_time.append(stopped.wait(PATIENCE_S))
+        node.request_stop()
+
+    def stop_motors(node):
+        if node.recv("emergency.stop"):
+            stopped.set()
+
+    sched.add(Node("logger", slow_log, pubs=["emergency.stop"]))
+    sched.add(Node("estop", stop_motors, on="emergency.stop", **urgency))
+
+    sched.run()
+
+    assert in_time[0] is True
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("sender_kind", ["BestEffort", "AsyncIo", "Rt", "Compute"])
+def test_an_urgent_event_node_has_one_tick_per_message_in_order(make, loop, sender_kind):
+    """On its own thread, too, an event node has one tick per message, first in, first out."""
+    received = []
+    sent = []
+
+    def send(node):
+        for _ in range(3):
+            sent.append(len(sent))
+            node.send("number", sent[-1])
+
+    sched = make(loop=loop)
+    sched.add(node_of(sender_kind, "sender", send, pubs=["number"]))
+    sched.add(Node("event", lambda n: received.append(n.recv("number")), on="number", deadline=0.5))
+
+    with running(sched):
+        wait_until(lambda: len(received) >= 9)
+
+    assert received == sent[: len(received)]
 
 
 @pytest.mark.realtime

@@ -124,6 +124,22 @@ def test_requested_real_time_features_that_are_missing_are_listed():
     assert {"rt_scheduling", "memory_locking", "cpu_isolation"} <= set(sched.capabilities())
 
 
+def test_pinning_and_priority_are_hints_that_are_missed_in_words():
+    """CPU pinning and priority without effect: the node runs, and degradations() names it."""
+    ticks = []
+    sched = Scheduler(tick_rate=100)
+    with pytest.warns(UnavailableWarning):
+        sched.add(Node("motor", lambda: ticks.append(1), rate=100, core=0, priority=80))
+
+    sched.tick_once()
+    sched.stop()
+
+    assert ticks == [1]
+    assert sched.get_node_stats("motor")["priority"] == 80
+    assert not sched.has_full_rt()
+    assert len([text for text in sched.degradations() if "motor" in text]) == 2
+
+
 def test_full_rt_is_true_when_nothing_was_requested():
     """has_full_rt() is true exactly when nothing requested was refused."""
     assert Scheduler().has_full_rt() is True

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 
+import anyio
 import pytest
 
 import horus
@@ -139,6 +140,18 @@ def end_by_time_limit(sched: Scheduler, loop: str) -> None:
     run_async(main(), loop)
 
 
+def end_by_an_anyio_scope(sched: Scheduler, loop: str) -> None:
+    """Cancel arun() by an anyio cancel scope, as structured applications do."""
+
+    async def main() -> None:
+        async with anyio.create_task_group() as group:
+            group.start_soon(sched.arun)
+            await until(lambda: all_have_ticked(sched))
+            group.cancel_scope.cancel()
+
+    run_async(main(), loop)
+
+
 def end_by_leaving_the_context(sched: Scheduler, loop: str) -> None:
     """Leave the `with` block while another thread runs the scheduler."""
     with sched:
@@ -169,6 +182,7 @@ WAYS_TO_END = (
     end_by_missed_budget,
     end_by_cancellation,
     end_by_time_limit,
+    end_by_an_anyio_scope,
     end_by_leaving_the_context,
     end_by_leaving_the_async_context,
 )

@@ -230,7 +230,7 @@ def test_a_bare_string_is_refused(make):
     """A string instead of a list of names is refused with the remedy."""
     sched = make()
     pipeline(sched)
-    with pytest.raises(ConfigError, match="names='sensor'.*list of node names"):
+    with pytest.raises(ConfigError, match=r"names='sensor'.*list of node names"):
         sched.tick_once("sensor")
 
 
