@@ -42,7 +42,7 @@ class RtThread(NodeThread):
             self.park(early_ns)
             return
         if -early_ns >= self.live.period_ns:
-            latest = self._grid.index_at(now_ns)
+            latest = self._grid.index_at(min(now_ns, self._timeline.end_ns - 1))
             self.live.counters.skipped += latest - self._index
             self._index = latest
             self._release_ns = self._grid.at(latest)

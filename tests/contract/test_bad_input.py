@@ -89,6 +89,17 @@ def test_a_tick_must_be_callable(tick):
     assert_refused(refused, "tick", tick, "")
 
 
+@pytest.mark.parametrize("argument", ["tick", "init", "shutdown", "safe_state"])
+@pytest.mark.parametrize(
+    "function", [lambda node, extra: None, lambda *, needed: None], ids=["two", "keyword"]
+)
+def test_a_callback_takes_the_node_or_nothing(argument, function):
+    """A callback that could never be called with the node, or without, is refused."""
+    callbacks = {"tick": nothing, argument: function}
+    with pytest.raises(ConfigError, match=argument):
+        Node("node", **callbacks)
+
+
 @pytest.mark.parametrize("argument", ["init", "shutdown", "safe_state", "on_error"])
 @pytest.mark.parametrize("value", [5, "setup"])
 def test_other_callbacks_must_be_callable_too(argument, value):

@@ -294,6 +294,17 @@ def test_dt_is_exactly_one_over_rate_in_deterministic_mode(make, kind, rate):
     assert seen == {1 / rate}
 
 
+def test_dt_of_a_best_effort_node_is_a_thirtieth_of_a_second(make):
+    """Without a rate the fixed dt() is that of 30 Hz, exactly."""
+    seen = set()
+    sched = make(tick_rate=1000, deterministic=True)
+    sched.add(Node("node", lambda: seen.add(horus.dt())))
+
+    sched.tick_for(5.0)
+
+    assert seen == {1 / 30}
+
+
 def test_dt_after_a_step_is_one_cycle(make):
     """The example of the contract: after tick_once(), horus.dt() is 1/100 Hz = 10 ms."""
     sched = make(tick_rate=100, deterministic=True)

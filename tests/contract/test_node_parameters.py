@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import pytest
 
@@ -212,10 +214,19 @@ def takes_defaults(bound: int = 5) -> None:
     calls.append((bound,))
 
 
+def takes_two(first: Any, node: Node) -> None:
+    """Take the node second."""
+    calls.append((type(first), type(node)))
+
+
 class CallableObject:
     """A callable with state."""
 
     def __call__(self, node: Node) -> None:
+        """Take the node."""
+        calls.append((type(node),))
+
+    def method(self, node: Node) -> None:
         """Take the node."""
         calls.append((type(node),))
 
@@ -230,6 +241,9 @@ calls: list[tuple] = []
         (takes_node, (Node,)),
         (takes_defaults, (5,)),
         (CallableObject(), (Node,)),
+        (CallableObject().method, (Node,)),
+        (functools.partial(takes_node), (Node,)),
+        (functools.partial(takes_two, "bound"), (str, Node)),
         (lambda: calls.append(()), ()),
         (lambda n: calls.append((type(n),)), (Node,)),
         (lambda *args: calls.append(tuple(map(type, args))), (Node,)),

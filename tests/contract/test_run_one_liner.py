@@ -150,6 +150,12 @@ def test_a_node_can_end_the_run():
     assert ticks == [0, 1, 2]
 
 
+def test_run_without_nodes_runs_for_its_time():
+    """No nodes is no error: there is just nothing to do."""
+    horus.run(duration=0.01)
+    horus.run(duration=0.01, deterministic=True)
+
+
 def test_run_can_be_called_again_with_the_same_nodes():
     """Nodes are plain values: the same ones can be run again."""
     ticks = []

@@ -315,6 +315,45 @@ def test_the_async_context_manager_raises_what_a_fatal_node_raised(make, loop):
         run_async(main(), loop)
 
 
+@pytest.mark.realtime
+def test_the_async_context_manager_shuts_down_when_the_application_fails(make, loop):
+    """An exception in the `async with` block: clean shutdown first, then it goes on."""
+    down = []
+    sched = make(tick_rate=100)
+    sched.add(Node("node", nothing, shutdown=lambda: down.append(1)))
+
+    async def main():
+        async with sched:
+            await until(lambda: all_have_ticked(sched))
+            raise LookupError("application error")
+
+    with pytest.raises(LookupError, match="application error"):
+        run_async(main(), loop)
+
+    assert down == [1]
+
+
+@pytest.mark.realtime
+def test_two_schedulers_share_one_event_loop(make, loop):
+    """Two robots in one application: two schedulers run beside each other on one loop."""
+    ticks = {"a": 0, "b": 0}
+    scheds = {name: make(tick_rate=100, name=name) for name in ticks}
+
+    async def tick(node):
+        ticks[node.name] += 1
+
+    for name, sched in scheds.items():
+        sched.add(Node(name, tick, rate=100))
+
+    async def main():
+        async with scheds["a"], scheds["b"]:
+            await until(lambda: min(ticks.values()) >= 3)
+
+    run_async(main(), loop)
+
+    assert {sched.status() for sched in scheds.values()} == {"stopped"}
+
+
 def test_a_name_is_unique_in_a_scheduler(make):
     """Two nodes of one name are refused where the second is added."""
     sched = make()

@@ -206,6 +206,27 @@ def test_shutdown_runs_once_in_reverse_order_across_all_classes_on_every_exit_pa
     assert {info["state"] for info in sched.get_all_nodes()} == {"stopped"}
 
 
+@pytest.mark.parametrize(
+    "end",
+    # In virtual time a plain tick takes none, so it cannot exceed its budget.
+    [end for end in WAYS_TO_END if end is not end_by_missed_budget],
+    ids=lambda end: end.__name__,
+)
+def test_a_simulation_shuts_down_in_the_same_order_on_every_exit_path(make, end):
+    """In deterministic mode too: every node once, in reverse order, on every exit path."""
+    journal = []
+    sched = make(tick_rate=100, deterministic=True)
+    orders = {"Rt": 10, "BestEffort": 30, "Compute": 20, "Event": 0, "AsyncIo": 40}
+    for kind, order in orders.items():
+        sched.add(node_of(kind, kind, order=order, shutdown=lambda node: journal.append(node.name)))
+    sched.publish(TRIGGER, 1)
+
+    end(sched, "asyncio")
+
+    assert journal == ["AsyncIo", "BestEffort", "Compute", "Rt", "Event"]
+    assert sched.status() == "stopped"
+
+
 @pytest.mark.realtime
 @pytest.mark.parametrize("end", WAYS_TO_END, ids=lambda end: end.__name__)
 def test_the_main_loop_exits_before_shutdown_begins(make, end):
