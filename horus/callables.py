@@ -19,19 +19,26 @@ def is_async_callable(function: Callback | None) -> bool:
     )
 
 
-def takes_node(function: Callback) -> bool:
-    """Return whether a callback asks for the node: by a positional parameter without default."""
+def takes_node(function: Callback) -> bool | None:
+    """Return whether a callback asks for the node; None if it can be called neither way.
+
+    It asks by a positional parameter without default. A parameter with a default
+    was bound by the author (`lambda i=i: ...`) and is no place for the node.
+    """
     try:
-        parameters = inspect.signature(function).parameters.values()
+        signature = inspect.signature(function)
     except (TypeError, ValueError):
-        return True
-    # A default marks a value that the author bound (`lambda i=i: ...`), not a
-    # place for the node.
-    return any(
+        return True  # written in C: nothing is known
+    asks = any(
         parameter.kind is parameter.VAR_POSITIONAL
         or (
             parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
             and parameter.default is parameter.empty
         )
-        for parameter in parameters
+        for parameter in signature.parameters.values()
     )
+    try:
+        signature.bind(*[None] * asks)
+    except TypeError:
+        return None
+    return asks

@@ -102,6 +102,7 @@ class Node:
         }
         if callbacks["tick"] is None:
             raise ConfigError("tick", tick, "a node needs a tick function or a tick() method")
+        _refuse_uncallable(callbacks)
         is_async = is_async_callable(callbacks["tick"])
         _refuse_stray_async(callbacks, is_async)
         spec = make_node_spec(
@@ -397,6 +398,12 @@ def _without_arguments(function: Callback | None, node: Node) -> Callable[[], An
     if function is None or not takes_node(function):
         return function
     return functools.partial(function, node)
+
+
+def _refuse_uncallable(callbacks: Mapping[str, Callback | None]) -> None:
+    for argument, function in callbacks.items():
+        if function is not None and argument != "on_error" and takes_node(function) is None:
+            raise ConfigError(argument, function, "must take the node, or nothing")
 
 
 def _refuse_stray_async(callbacks: Mapping[str, Callback | None], is_async: bool) -> None:

@@ -1,6 +1,10 @@
-"""What only the kernel can do for timing: the one home of timerfd and its like.
+"""What only the kernel can do for timing: the one home of these calls.
 
-Source: timerfd_create(2), clock_nanosleep(2).
+Everything here concerns the calling thread or the whole process, raises OSError
+where the kernel refuses, and does nothing on its own account.
+
+Source: timerfd_create(2), sched(7), sched_setaffinity(2), mlockall(2),
+PR_SET_TIMERSLACK in prctl(2), /sys/devices/system/cpu/isolated.
 """
 
 from __future__ import annotations
@@ -10,8 +14,14 @@ import functools
 import os
 import sys
 import time
+from collections.abc import Iterable
+from pathlib import Path
 
 _TFD_TIMER_ABSTIME = 1
+_PR_SET_TIMERSLACK = 29
+_PR_GET_TIMERSLACK = 30
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_CAP_IPC_LOCK = 14
 _NS_PER_S = 1_000_000_000
 
 
@@ -45,18 +55,14 @@ class TimerFd:
         self._settime = libc.timerfd_settime
         flags = os.O_NONBLOCK | os.O_CLOEXEC
         self.fd: int = libc.timerfd_create(time.CLOCK_MONOTONIC, flags)
-        if self.fd < 0:
-            error = ctypes.get_errno()
-            raise OSError(error, os.strerror(error))
+        _check(self.fd)
 
     def arm(self, at_ns: int) -> None:
         """Fire at `at_ns` on CLOCK_MONOTONIC [ns]; at once if that is past."""
         value = self._spec.it_value
         # An all-zero time would disarm the timer instead.
         value.tv_sec, value.tv_nsec = divmod(max(1, at_ns), _NS_PER_S)
-        if self._settime(self.fd, _TFD_TIMER_ABSTIME, self._pointer, None) != 0:
-            error = ctypes.get_errno()
-            raise OSError(error, os.strerror(error))
+        _check(self._settime(self.fd, _TFD_TIMER_ABSTIME, self._pointer, None))
 
     def acknowledge(self) -> None:
         """Make the descriptor unreadable again."""
@@ -68,3 +74,112 @@ class TimerFd:
     def close(self) -> None:
         """Give the descriptor back."""
         os.close(self.fd)
+
+
+def run_fifo(priority: int) -> None:
+    """Schedule the calling thread with SCHED_FIFO at `priority`, 1 to 99.
+
+    Raises:
+        OSError: Not permitted (no CAP_SYS_NICE), or not on this platform.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        raise OSError("SCHED_FIFO is not available on this platform")
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+
+
+def affinity() -> set[int]:
+    """Return the cores that the calling thread may run on."""
+    if not hasattr(os, "sched_getaffinity"):
+        return set(range(os.cpu_count() or 1))
+    return os.sched_getaffinity(0)
+
+
+def run_on(cores: Iterable[int]) -> None:
+    """Let the calling thread run on these cores only.
+
+    Raises:
+        OSError: None of them may be used, or not on this platform.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        raise OSError("pinning is not available on this platform")
+    os.sched_setaffinity(0, cores)
+
+
+def timer_slack_ns() -> int:
+    """Return by how much the calling thread's sleeps may be stretched [ns]."""
+    return _prctl(_PR_GET_TIMERSLACK, 0)
+
+
+def set_timer_slack(slack_ns: int) -> None:
+    """Let the calling thread's sleeps be stretched by at most `slack_ns`; 0 for the default.
+
+    Threads of SCHED_FIFO have none anyway.
+    """
+    _prctl(_PR_SET_TIMERSLACK, slack_ns)
+
+
+def lock_memory() -> None:
+    """Keep what is mapped now in memory, and what is mapped later once it is touched.
+
+    Raises:
+        OSError: Not permitted (RLIMIT_MEMLOCK, no CAP_IPC_LOCK), or not on this
+            platform. Nothing is locked then.
+    """
+    if sys.platform != "linux":
+        raise OSError("mlockall is not available on this platform")
+    _check(_libc().mlockall(_MCL_CURRENT))
+    _check(_libc().mlockall(_MCL_FUTURE | _MCL_ONFAULT))
+
+
+def unlock_memory() -> None:
+    """Undo `lock_memory`."""
+    _libc().munlockall()
+
+
+def may_lock_memory() -> bool:
+    """Return whether `lock_memory` would be permitted, without doing it."""
+    if sys.platform != "linux":
+        return False
+    import resource
+
+    unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
+    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    effective = next(
+        (int(line.split()[1], 16) for line in status.splitlines() if line.startswith("CapEff")), 0
+    )
+    return unlimited or bool(effective >> _CAP_IPC_LOCK & 1)
+
+
+def isolated_cores() -> set[int]:
+    """Return the cores that the kernel keeps free of ordinary work (isolcpus=)."""
+    cores: set[int] = set()
+    for part in _read("/sys/devices/system/cpu/isolated").split(","):
+        first, _, last = part.partition("-")
+        if first.isdigit():
+            cores.update(range(int(first), int(last or first) + 1))
+    return cores
+
+
+def is_preempt_rt() -> bool:
+    """Return whether the kernel is built with PREEMPT_RT."""
+    return _read("/sys/kernel/realtime") == "1"
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+def _prctl(option: int, argument: int) -> int:
+    if sys.platform != "linux":
+        raise OSError("prctl is a Linux interface")
+    return _check(_libc().prctl(option, ctypes.c_ulong(argument), 0, 0, 0))
+
+
+def _check(result: int) -> int:
+    if result < 0:
+        error = ctypes.get_errno()
+        raise OSError(error, os.strerror(error))
+    return result

@@ -10,6 +10,7 @@ from typing import Any, Self
 
 from horus import unavailable
 from horus.errors import ConfigError, StateError
+from horus.loop.realtime import capabilities
 from horus.node import Node, NodeCore, core_of
 from horus.ports import DEFAULT_CAPACITY
 from horus.registry import node_stats
@@ -384,17 +385,22 @@ class Scheduler:
         """Return the sums of what went wrong, and each node's health."""
         return self._registry.safety_stats()
 
-    def capabilities(self) -> dict[str, bool]:
-        """Return which real-time features are in force."""
-        return {"rt_scheduling": False, "memory_locking": False, "cpu_isolation": False}
+    def capabilities(self) -> dict[str, Any]:
+        """Return what real-time features this process may have, and facts about the machine.
+
+        `rt_scheduling`: SCHED_FIFO is permitted. `memory_locking`: mlockall is.
+        `cpu_isolation`: the kernel keeps cores free, listed in `isolated_cores`.
+        Further `cores`, `preempt_rt` and `kernel`.
+        """
+        return capabilities()
 
     def has_full_rt(self) -> bool:
-        """Return whether nothing that was requested is missing."""
+        """Return whether nothing that was requested was refused."""
         return not self.degradations()
 
     def degradations(self) -> list[str]:
-        """Return what was requested and could not be had, in readable sentences."""
-        return unavailable.degradations(self._spec, [live.spec for live in self._registry.in_order])
+        """Return what was requested and refused, in readable sentences."""
+        return self._session.real_time.degradations()
 
     # -- recording: the contract's names, refused until there is something behind them --
 

@@ -15,7 +15,8 @@ from horus.executors import make_executors
 from horus.live import LiveNode
 from horus.loop.control import RunControl
 from horus.loop.private_loop import StepLoop
-from horus.loop.runtime import Runtime
+from horus.loop.realtime import RealTime
+from horus.loop.runtime import Runtime, uninterrupted
 from horus.loop.signals import stop_on_signals
 from horus.loop.simulation import Simulation
 from horus.loop.stepping import Stepper
@@ -55,6 +56,7 @@ class Session:
         )
         self.registry = Registry(self.bus, self.timeline)
         self.control = RunControl(spec.max_deadline_misses)
+        self.real_time = RealTime(spec)
         self.status = "idle"
         self._lock = threading.Lock()
         self._open = False
@@ -278,7 +280,11 @@ class Session:
     def _start_runtime(self) -> Runtime:
         if self._runtime is None:
             self._runtime = Runtime(
-                self._spec.name, self.timeline, make_executors, self._spec.shutdown_timeout_ns
+                self._spec.name,
+                self.timeline,
+                self.real_time,
+                make_executors,
+                self._spec.shutdown_timeout_ns,
             )
         if self.control.stopping:
             self._runtime.request_stop()
@@ -310,12 +316,16 @@ class Session:
                 self.control.end()
                 self._close()
 
-        simulation = asyncio.ensure_future(asyncio.to_thread(simulate))
+        simulation = asyncio.get_running_loop().run_in_executor(None, simulate)
+
+        async def watch() -> None:
+            await asyncio.wait([simulation])
+
         try:
             await asyncio.shield(simulation)
         except asyncio.CancelledError:
             self.control.request_stop("cancelled")
-            await asyncio.wait([simulation])
+            await uninterrupted(watch)
             raise
 
     def _wait_for(self, live: LiveNode, runtime: Runtime) -> None:

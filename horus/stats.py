@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from horus.units import to_s
@@ -35,8 +37,10 @@ class TickTimes:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._executions = [0] * (_BUCKETS + 1)
-        self._latencies = [0] * (_BUCKETS + 1)
+        # Arrays, not lists: a collector that walks thousands of references per node
+        # stops a program of many nodes for tens of milliseconds.
+        self._executions = array("Q", bytes(8 * (_BUCKETS + 1)))
+        self._latencies = array("Q", bytes(8 * (_BUCKETS + 1)))
         self.execution_total_ns = self.execution_max_ns = 0
         self.latency_total_ns = self.latency_max_ns = 0
 
@@ -73,7 +77,7 @@ def _bucket(duration_ns: int) -> int:
     return min(_COARSE_OFFSET + (duration_ns >> _COARSE_SHIFT), _BUCKETS)
 
 
-def _quantile_ns(buckets: list[int], fraction: float) -> int:
+def _quantile_ns(buckets: Sequence[int], fraction: float) -> int:
     wanted = fraction * sum(buckets)
     seen = 0
     for index, count in enumerate(buckets):

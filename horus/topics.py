@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from horus.errors import ConfigError, TopicError, describe
 from horus.ports import DEFAULT_CAPACITY
-from horus.snapshot import ATOMS, Frozen, UnsendableError, freeze
+from horus.snapshot import Frozen, UnsendableError, freeze
 from horus.validation import check_topic
 
 _log = logging.getLogger("horus.topics")
@@ -177,7 +177,11 @@ class Publisher:
                 f"topic {topic.name!r}: {self.owner} sent None, which is what recv() returns "
                 "when there is nothing; send a value such as True or {}"
             )
-        return (message, None) if type(message) in ATOMS else self._freeze(message)
+        try:
+            return freeze(message)
+        except Exception as exc:
+            # RecursionError, and whatever code of the message's own class raises.
+            raise self._unsendable(message, exc) from exc
 
     def deliver(self, frozen: Frozen) -> None:
         """Append an isolated message to every subscription's queue."""
@@ -200,23 +204,17 @@ class Publisher:
         """Take the sender away from the topic; what it sent stays counted."""
         self.topic.retire(self)
 
-    def _freeze(self, message: Any) -> Frozen:
-        where = ""
-        cause: Exception
-        try:
-            return freeze(message)
-        except UnsendableError as exc:
-            where = f" (in {exc.path})" if exc.path else ""
-            reason, cause = str(exc), exc
-        except RecursionError as exc:
-            reason, cause = "it contains itself or is nested too deeply", exc
-        except Exception as exc:
-            # Code of the message's own class, e.g. a property that raises.
-            reason, cause = f"{type(exc).__name__}: {exc}", exc
-        raise TopicError(
+    def _unsendable(self, message: Any, exc: Exception) -> TopicError:
+        if isinstance(exc, UnsendableError):
+            reason = f"{exc} (in {exc.path})" if exc.path else str(exc)
+        elif isinstance(exc, RecursionError):
+            reason = "it is nested too deeply"
+        else:
+            reason = f"{type(exc).__name__}: {exc}"
+        return TopicError(
             f"topic {self.topic.name!r}: {self.owner} sent a {type(message).__name__} "
-            f"that cannot be isolated: {reason}{where}"
-        ) from cause
+            f"that cannot be isolated: {reason}"
+        )
 
 
 class Topic:

@@ -11,8 +11,6 @@ from horus.spec import NodeSpec, SchedulerSpec
 def warn_of_scheduler(spec: SchedulerSpec) -> None:
     """Warn of the arguments of a scheduler that have no effect."""
     for asked, argument, consequence in (
-        (spec.rt, "rt=True", "nodes run with ordinary priority; see degradations()"),
-        (spec.cores, "cores=", "threads may run on any core"),
         (spec.watchdog_ns, "watchdog_ms=", "frozen nodes are not detected"),
         (spec.blackbox_mb, "blackbox_mb=", "there is no flight recorder"),
         (spec.recording, "recording=True", "nothing is recorded"),
@@ -24,13 +22,8 @@ def warn_of_scheduler(spec: SchedulerSpec) -> None:
 
 def warn_of_node(spec: NodeSpec) -> None:
     """Warn of the arguments of a node that have no effect."""
-    for asked, argument, consequence in (
-        (spec.watchdog_ns, "watchdog=", "a frozen tick is not detected"),
-        (spec.priority, "priority=", "its thread has ordinary priority"),
-        (spec.core is not None, "core=", "its thread may run on any core"),
-    ):
-        if asked:
-            warn(f"{argument} of node {spec.name!r}", consequence)
+    if spec.watchdog_ns:
+        warn(f"watchdog= of node {spec.name!r}", "a frozen tick is not detected")
 
 
 def warn(feature: str, consequence: str) -> None:
@@ -45,19 +38,3 @@ def refuse_recording(what: str) -> NoReturn:
         StateError: Always.
     """
     raise StateError(f"recording is not part of this version; there is no {what}")
-
-
-def degradations(spec: SchedulerSpec, nodes: list[NodeSpec]) -> list[str]:
-    """Return what was requested and could not be had, in readable sentences."""
-    missing = []
-    if spec.rt:
-        missing.append("SCHED_FIFO is not part of this version - using SCHED_OTHER")
-        missing.append("mlockall is not part of this version - memory pages may be swapped")
-    if spec.cores is not None:
-        missing.append("cores= is not part of this version - threads may run on any core")
-    for node in nodes:
-        if node.core is not None:
-            missing.append(f"node {node.name!r} is not pinned to core {node.core}")
-        if node.priority is not None:
-            missing.append(f"node {node.name!r} does not have priority {node.priority}")
-    return missing

@@ -10,15 +10,18 @@ from horus.executors.rt import RtExecutor
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
 from horus.loop.executor import Executor
+from horus.loop.realtime import RealTime
 from horus.spec import ExecutionClass
 
 
-def make_executors(bridge: Bridge, cycle: Cycle) -> dict[ExecutionClass, Executor]:
+def make_executors(
+    bridge: Bridge, cycle: Cycle, real_time: RealTime
+) -> dict[ExecutionClass, Executor]:
     """Return the executors of one run."""
     return {
         ExecutionClass.BEST_EFFORT: BestEffortExecutor(bridge, cycle),
-        ExecutionClass.EVENT: EventExecutor(bridge, cycle),
+        ExecutionClass.EVENT: EventExecutor(bridge, cycle, real_time),
         ExecutionClass.ASYNC_IO: AsyncIoExecutor(bridge, cycle),
-        ExecutionClass.RT: RtExecutor(),
+        ExecutionClass.RT: RtExecutor(real_time),
         ExecutionClass.COMPUTE: ComputeExecutor(cycle),
     }

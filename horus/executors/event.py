@@ -13,6 +13,7 @@ from horus.live import EventTick, LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
 from horus.loop.executor import Executor
+from horus.loop.realtime import RealTime
 from horus.tick_path import RunTick, build_tick
 from horus.units import to_s
 
@@ -24,10 +25,10 @@ class EventExecutor:
     stop must not wait behind a logger that blocks the loop.
     """
 
-    def __init__(self, bridge: Bridge, cycle: Cycle) -> None:
+    def __init__(self, bridge: Bridge, cycle: Cycle, real_time: RealTime) -> None:
         """Serve the nodes of one run."""
         self._on_loop = LoopEventExecutor(bridge, cycle)
-        self._on_threads = ThreadEventExecutor()
+        self._on_threads = ThreadEventExecutor(real_time)
 
     def adopt(self, live: LiveNode) -> None:
         """Give the node its home."""
@@ -95,9 +96,9 @@ class Arrivals:
 class EventThread(NodeThread):
     """Sleeps until a message arrives, and ticks."""
 
-    def __init__(self, live: LiveNode) -> None:
+    def __init__(self, live: LiveNode, real_time: RealTime) -> None:
         """Prepare a thread that does not listen yet."""
-        super().__init__(live)
+        super().__init__(live, functools.partial(real_time.enter_node_thread, live))
         self.engaged = False
         self.arrivals = Arrivals(live)
         self._run_tick = build_tick(live)
@@ -127,9 +128,14 @@ class EventThread(NodeThread):
 class ThreadEventExecutor(ThreadExecutor[EventThread]):
     """Gives every node an `EventThread`."""
 
+    def __init__(self, real_time: RealTime) -> None:
+        """Serve the nodes of one run."""
+        super().__init__()
+        self._real_time = real_time
+
     def make_thread(self, live: LiveNode) -> EventThread:
         """Return the node's thread, not started."""
-        return EventThread(live)
+        return EventThread(live, self._real_time)
 
     def engage(self, live: LiveNode, from_ns: int) -> None:
         """Listen to the trigger topic, starting with what has arrived already."""

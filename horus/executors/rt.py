@@ -6,6 +6,7 @@ import functools
 
 from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
+from horus.loop.realtime import RealTime
 from horus.tick_path import build_tick
 
 
@@ -16,9 +17,9 @@ class RtThread(NodeThread):
     ones are skipped and counted, and the next one stays where it always was.
     """
 
-    def __init__(self, live: LiveNode) -> None:
+    def __init__(self, live: LiveNode, real_time: RealTime) -> None:
         """Prepare a thread that does not release yet."""
-        super().__init__(live)
+        super().__init__(live, functools.partial(real_time.enter_node_thread, live))
         self.engaged = False
         self._run_tick = build_tick(live)
         self._timeline = live.timeline
@@ -69,9 +70,14 @@ class RtThread(NodeThread):
 class RtExecutor(ThreadExecutor[RtThread]):
     """Gives every node an `RtThread`."""
 
+    def __init__(self, real_time: RealTime) -> None:
+        """Serve the nodes of one run."""
+        super().__init__()
+        self._real_time = real_time
+
     def make_thread(self, live: LiveNode) -> RtThread:
         """Return the node's thread, not started."""
-        return RtThread(live)
+        return RtThread(live, self._real_time)
 
     def engage(self, live: LiveNode, from_ns: int) -> None:
         """Let the thread release the node."""

@@ -29,10 +29,11 @@ class NodeThread(threading.Thread):
     Thread: any for `post`, `call` and `close`; the others are the thread's own.
     """
 
-    def __init__(self, live: LiveNode) -> None:
-        """Prepare a thread for `live`; it runs from `start()` on."""
+    def __init__(self, live: LiveNode, enter: Callable[[], None] = lambda: None) -> None:
+        """Prepare a thread for `live`, which begins with `enter`; it runs from `start()` on."""
         super().__init__(name=f"horus:{live.name}", daemon=True)
         self.live = live
+        self._enter = enter
         self._jobs: deque[Callable[[], None]] = deque()
         self._closing = False
         # A lock as a binary semaphore. Waiting for it with a timeout sleeps as
@@ -70,6 +71,7 @@ class NodeThread(threading.Thread):
 
     def run(self) -> None:
         """Serve until closed, whatever happens: `shutdown()` is to run here, too."""
+        self._enter()
         while not self._closing or self._jobs:
             try:
                 if self._jobs:

@@ -19,6 +19,7 @@ from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
 from horus.loop.executor import Executor
 from horus.loop.gil import prompt_switching
+from horus.loop.realtime import RealTime
 from horus.loop.shutdown import begin_shutdown, quiesce, shut_down
 from horus.loop.supervisor import Supervisor, report_blocked_loop
 from horus.spec import ExecutionClass, NodeState
@@ -27,7 +28,7 @@ from horus.units import NS_PER_MS, to_s
 _HEAD_START_NS = 2 * NS_PER_MS
 """From the last `init()` to release 0 [ns]: time for every thread to be ready for it."""
 
-MakeExecutors = Callable[[Bridge, Cycle], Mapping[ExecutionClass, Executor]]
+MakeExecutors = Callable[[Bridge, Cycle, RealTime], Mapping[ExecutionClass, Executor]]
 Members = Callable[[], Iterable[LiveNode]]
 
 
@@ -45,12 +46,14 @@ class Runtime:
         self,
         name: str,
         timeline: Timeline,
+        real_time: RealTime,
         make_executors: MakeExecutors,
         shutdown_timeout_ns: int,
     ) -> None:
         """Describe a run; nothing happens before `play`."""
         self._name = name
         self._timeline = timeline
+        self._real_time = real_time
         self._make_executors = make_executors
         self._shutdown_timeout_ns = shutdown_timeout_ns
         self._resources = contextlib.ExitStack()
@@ -59,6 +62,7 @@ class Runtime:
         self._joining: deque[LiveNode] = deque()
         self._playing = False
         self._switches_promptly = False
+        self._process_ready = False
         self._closing = False
         self._stop_requested = False
         self._reacted = threading.Event()
@@ -81,6 +85,9 @@ class Runtime:
             self._open()
         try:
             await self._initialize(members())
+            if not self._process_ready:
+                self._process_ready = True
+                self._resources.enter_context(self._real_time.in_process())
             self._engage(set(members()), duration_ns)
             await self._until_stopped()
         finally:
@@ -200,14 +207,15 @@ class Runtime:
         # anyio loads its backend on first use, which takes tens of milliseconds:
         # now, not after the first release.
         anyio.current_effective_deadline()
-        self._supervisor = Supervisor(self._name)
+        self._resources.enter_context(self._real_time.in_loop_thread())
+        self._supervisor = Supervisor(self._name, self._real_time.enter_supervisor_thread)
         self._supervisor.start()
         self._resources.callback(self._supervisor.close)
         bridge = Bridge(asyncio.get_running_loop())
         self._resources.callback(bridge.close)
         cycle = Cycle(bridge.loop, self._timeline)
         self._resources.callback(cycle.close)
-        self._executors = self._make_executors(bridge, cycle)
+        self._executors = self._make_executors(bridge, cycle, self._real_time)
         with self._lock:
             self._bridge = bridge
         while self._notes:

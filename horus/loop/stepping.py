@@ -43,6 +43,8 @@ class Stepper:
         self._plain: dict[LiveNode, RunTick] = {}
         self._async: dict[LiveNode, RunTickAsync] = {}
         self._in_order: tuple[LiveNode, ...] = ()
+        # Each node with its plain tick path; None where a tick takes more than a call.
+        self._cycle: list[tuple[LiveNode, RunTick | None]] = []
         self._taken_on: tuple[LiveNode, ...] = ()
         self._depth = 0
         self._driver: int | None = None
@@ -109,17 +111,25 @@ class Stepper:
         An event node ticks once per message that waits when its turn comes.
         """
         timeline = self.timeline
+        now_ns = timeline.now_ns
+        stopped = self.stopped
         timeline.begin_step()
         self.begin_driving()
         try:
-            for live in self._in_order:
+            for live, run_tick in self._cycle:
                 if live.retired or (named is not None and live not in named):
                     continue
-                if live.trigger is not None:
+                if run_tick is not None:
+                    self._depth += 1
+                    run_tick(now_ns())
+                    self._depth -= 1
+                    if self._changes:
+                        self._make_changes()
+                elif live.trigger is not None:
                     self._tick_per_message(live)
                 else:
-                    self.tick(live, timeline.now_ns())
-                if self.stopped():
+                    self.tick(live, now_ns())
+                if stopped():
                     break
         finally:
             self.end_driving()
@@ -131,9 +141,9 @@ class Stepper:
 
     def end_driving(self) -> None:
         """Make the changes that others have asked for, and let them make their own."""
+        self._depth = 0
         with self._lock:
-            while self._changes:
-                self._changes.popleft()()
+            self._make_changes()
             self._driver = None
 
     def shut_down(self, lives: Iterable[LiveNode]) -> None:
@@ -161,13 +171,20 @@ class Stepper:
         if live.state is NodeState.UNINITIALIZED:
             self.run_phase(live, "init")
         live.enter_service()
-        self._in_order = tuple(sorted((*self._in_order, live), key=lambda live: live.rank))
+        self._put_in_order((*self._in_order, live))
 
     def _remove(self, live: LiveNode) -> None:
-        self._in_order = tuple(other for other in self._in_order if other is not live)
+        self._put_in_order(other for other in self._in_order if other is not live)
         self.shut_down_one(live)
         self._plain.pop(live, None)
         self._async.pop(live, None)
+
+    def _put_in_order(self, lives: Iterable[LiveNode]) -> None:
+        self._in_order = tuple(sorted(lives, key=lambda live: live.rank))
+        self._cycle = [
+            (live, None if live.trigger is not None else self._plain.get(live))
+            for live in self._in_order
+        ]
 
     def _change(self, live: LiveNode, change: Callable[[], None]) -> None:
         """Change who takes part: now, or when the callback on the stack below has ended.
@@ -193,6 +210,10 @@ class Stepper:
     def _callback_ended(self) -> None:
         """Make the changes that had to wait for the end of the outermost callback."""
         self._depth -= 1
+        if self._changes:
+            self._make_changes()
+
+    def _make_changes(self) -> None:
         while self._changes and not self._depth:
             self._changes.popleft()()
 

@@ -23,8 +23,9 @@ class Supervisor:
     Thread: any for `spawn`; `start` and `close` belong to the run loop.
     """
 
-    def __init__(self, name: str) -> None:
-        """Prepare the thread of the scheduler called `name`."""
+    def __init__(self, name: str, enter_thread: Callable[[], None]) -> None:
+        """Prepare the thread of the scheduler called `name`; `enter_thread` sets it up."""
+        self._enter_thread = enter_thread
         self._loop = asyncio.new_event_loop()
         self._tasks: set[asyncio.Task[None]] = set()
         self._thread = threading.Thread(
@@ -52,7 +53,7 @@ class Supervisor:
         self._thread.join()
 
     def _serve(self) -> None:
-        asyncio.set_event_loop(self._loop)
+        self._enter_thread()
         try:
             self._loop.run_forever()
         finally:

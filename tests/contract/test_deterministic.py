@@ -352,8 +352,8 @@ def test_a_signal_handler_is_restored_after_a_simulation_as_well():
     assert sched.status() == "stopped"
 
 
-def test_a_run_without_end_is_not_stopped_by_running_out_of_nodes():
-    """With nothing but event nodes and no message, an endless simulation ends: nothing is left."""
+def test_an_endless_simulation_ends_when_nothing_is_left_to_happen():
+    """With nothing but idle event nodes, nothing is left to simulate: run() returns."""
     sched = Scheduler(tick_rate=100, deterministic=True)
     sched.add(Node("event", nothing, on="go"))
     begun = time.monotonic()

@@ -289,7 +289,7 @@ def test_a_flood_of_events_leaves_the_loop_its_turn(make, loop):
         node.send("go", 1)
         node.send("go", 1)
 
-    sched.add(Node("event", tick, on=("go"), subs=[Sub("go", capacity=64)], pubs=["go"]))
+    sched.add(Node("event", tick, on="go", subs=[Sub("go", capacity=64)], pubs=["go"]))
     sched.add(Node("logger", lambda: ticks.append(1)))
     sched.publish("go", 1)
 

@@ -1,7 +1,7 @@
 """Where the original breaks its own documentation: each point is kept here.
 
-Most of them have their tests in the file of their section; this one says each in
-one place, as small as it can be.
+Each as small as it can be; those about signals and the end of a process are in
+test_shutdown.py, where the programs are that they need.
 """
 
 from __future__ import annotations

@@ -249,8 +249,8 @@ def test_verbose_shows_debug_messages_and_the_timing_report():
     assert "Rt" in done.stdout
 
 
-def test_a_slow_log_handler_does_not_lose_records(make, caplog, loop):
-    """Records logged right before the end of a run are not lost."""
+def test_the_last_words_of_a_node_are_logged(make, caplog, loop):
+    """Records logged in shutdown(), right before the end of a run, are not lost."""
     caplog.set_level(logging.INFO, logger="horus")
     sched = make(tick_rate=100)
     sched.add(Node("node", nothing, shutdown=lambda node: node.log_info("last words")))

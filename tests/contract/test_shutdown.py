@@ -434,7 +434,7 @@ def test_a_tick_in_progress_ends_before_its_node_shuts_down(make, loop, slow_kin
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("stuck_kind", ["Rt", "Compute", "AsyncIo"])
-def test_a_shutdown_that_hangs_does_not_hold_up_the_others(make, loop, stuck_kind, caplog):
+def test_a_shutdown_that_hangs_does_not_hold_up_the_others(make, stuck_kind, caplog):
     """Each node's shutdown() is bounded in time; the others are shut down all the same."""
     let_go = threading.Event()
     journal = []
@@ -447,7 +447,7 @@ def test_a_shutdown_that_hangs_does_not_hold_up_the_others(make, loop, stuck_kin
         journal.append("hangs")
         let_go.wait(PATIENCE_S)
 
-    sched = make(tick_rate=100, loop=loop, shutdown_timeout=0.2)
+    sched = make(tick_rate=100, shutdown_timeout=0.2)
     sched.add(Node("other", nothing, order=0, shutdown=lambda n: journal.append(n.name)))
     sched.add(
         node_of(

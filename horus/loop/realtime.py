@@ -1,0 +1,218 @@
+"""Real-time scheduling: what is asked of the kernel, what it grants, and how it is given back.
+
+With `rt=True` everything below is applied when a run starts; a refusal is a
+readable degradation, never an error. Explicit `priority`, `core` and `cores` are
+applied without it, too, as well as they can be.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import logging
+import math
+import os
+import threading
+from collections.abc import Iterator
+
+from horus import os_rt
+from horus.live import LiveNode
+from horus.spec import SchedulerSpec
+
+_log = logging.getLogger("horus.scheduler")
+
+_SUPERVISOR_PRIORITY = 95
+_LOWEST_PRIORITY, _HIGHEST_PRIORITY = 50, 89
+_TIMER_SLACK_NS = 1
+
+
+class RealTime:
+    """The real-time side of one scheduler.
+
+    Thread: any; `enter_*` concern the thread that calls them.
+    """
+
+    def __init__(self, spec: SchedulerSpec) -> None:
+        """Find out what would be granted, without changing anything that lasts."""
+        self._rt = spec.rt
+        self._cores = spec.cores
+        self._degradations: dict[str, None] = {}
+        self._lock = threading.Lock()
+        if spec.rt:
+            fifo = _try_fifo()
+            if fifo is not None:
+                self.degrade(f"SCHED_FIFO unavailable ({fifo}) - using SCHED_OTHER")
+            if not os_rt.may_lock_memory():
+                self.degrade(
+                    "mlockall not permitted (RLIMIT_MEMLOCK, no CAP_IPC_LOCK) - "
+                    "memory pages may be swapped"
+                )
+
+    def degradations(self) -> list[str]:
+        """Return what was requested and refused."""
+        with self._lock:
+            return list(self._degradations)
+
+    def degrade(self, what: str) -> None:
+        """Take note of a refusal, and log it the first time."""
+        with self._lock:
+            if what in self._degradations:
+                return
+            self._degradations[what] = None
+        _log.warning("%s", what)
+
+    def priority_of(self, live: LiveNode) -> int | None:
+        """Return the SCHED_FIFO priority of a node's thread; None for ordinary scheduling.
+
+        Explicit, or with `rt=True` rate-monotonic: 50 at 1 Hz, ten more for each
+        factor of ten.
+        """
+        if live.spec.priority is not None:
+            return live.spec.priority
+        if not self._rt:
+            return None
+        by_rate = _LOWEST_PRIORITY + round(10 * math.log10(live.spec.rate_hz))
+        return min(max(by_rate, _LOWEST_PRIORITY), _HIGHEST_PRIORITY)
+
+    def enter_node_thread(self, live: LiveNode) -> None:
+        """Give a node's thread its core, its priority and exact sleeps; it ends with the run."""
+        cores = self._cores if live.spec.core is None else (live.spec.core,)
+        if cores is not None:
+            self._pin(cores, f"node {live.name!r}")
+        priority = self.priority_of(live)
+        if priority is not None:
+            try:
+                os_rt.run_fifo(priority)
+            except OSError as exc:
+                reason = _reason(exc)
+                if self._rt:
+                    self.degrade(f"SCHED_FIFO unavailable ({reason}) - using SCHED_OTHER")
+                else:
+                    self.degrade(f"node {live.name!r}: priority {priority} refused ({reason})")
+        with contextlib.suppress(OSError):
+            os_rt.set_timer_slack(_TIMER_SLACK_NS)
+
+    def enter_supervisor_thread(self) -> None:
+        """Put supervision above every node."""
+        if self._rt:
+            with contextlib.suppress(OSError):
+                os_rt.run_fifo(_SUPERVISOR_PRIORITY)
+
+    @contextlib.contextmanager
+    def in_loop_thread(self) -> Iterator[None]:
+        """Pin the event loop's thread and make its timers exact, then put both back."""
+        cores = os_rt.affinity()
+        with contextlib.ExitStack() as undo:
+            if self._cores is not None:
+                self._pin(self._cores, "the scheduler")
+                undo.callback(os_rt.run_on, cores)
+            with contextlib.suppress(OSError):
+                undo.callback(os_rt.set_timer_slack, os_rt.timer_slack_ns())
+                os_rt.set_timer_slack(_TIMER_SLACK_NS)
+            yield
+
+    @contextlib.contextmanager
+    def in_process(self) -> Iterator[None]:
+        """With `rt=True`, lock memory and keep garbage collection out of ticks, then undo it."""
+        with contextlib.ExitStack() as undo:
+            if self._rt:
+                undo.enter_context(_memory_locked(self))
+                undo.enter_context(_garbage_frozen())
+            yield
+
+    def _pin(self, cores: tuple[int, ...], who: str) -> None:
+        try:
+            os_rt.run_on(cores)
+        except OSError as exc:
+            listing = ", ".join(map(str, cores))
+            self.degrade(f"{who} is not pinned to core {listing} ({_reason(exc)})")
+
+
+def capabilities() -> dict[str, object]:
+    """Return what this process could have, and facts about the machine."""
+    isolated = os_rt.isolated_cores()
+    return {
+        "rt_scheduling": _try_fifo() is None,
+        "memory_locking": os_rt.may_lock_memory(),
+        "cpu_isolation": bool(isolated),
+        "isolated_cores": sorted(isolated),
+        "cores": sorted(os_rt.affinity()),
+        "preempt_rt": os_rt.is_preempt_rt(),
+        "kernel": f"{os.uname().sysname} {os.uname().release}" if hasattr(os, "uname") else "",
+    }
+
+
+_process_lock = threading.Lock()
+_locked_by = 0
+_frozen_by = 0
+_collected_before = True
+
+
+@contextlib.contextmanager
+def _memory_locked(real_time: RealTime) -> Iterator[None]:
+    """Lock memory while any run wants it."""
+    global _locked_by
+    with _process_lock:
+        granted = True
+        if _locked_by == 0:
+            try:
+                os_rt.lock_memory()
+            except OSError as exc:
+                granted = False
+                real_time.degrade(f"mlockall failed ({_reason(exc)}) - memory pages may be swapped")
+        _locked_by += granted
+    try:
+        yield
+    finally:
+        with _process_lock:
+            _locked_by -= granted
+            if granted and _locked_by == 0:
+                os_rt.unlock_memory()
+
+
+@contextlib.contextmanager
+def _garbage_frozen() -> Iterator[None]:
+    """Leave garbage to `collect_garbage` while any run wants it.
+
+    An automatic collection stops all threads for milliseconds in a program with
+    many objects. What exists at the start is frozen: it is looked at no more.
+    """
+    global _frozen_by, _collected_before
+    with _process_lock:
+        if _frozen_by == 0:
+            _collected_before = gc.isenabled()
+            gc.collect()
+            gc.freeze()
+            gc.disable()
+        _frozen_by += 1
+    try:
+        yield
+    finally:
+        with _process_lock:
+            _frozen_by -= 1
+            if _frozen_by == 0:
+                gc.unfreeze()
+                if _collected_before:
+                    gc.enable()
+
+
+def _try_fifo() -> str | None:
+    """Return why SCHED_FIFO is refused, or None; tried on a thread that ends at once."""
+    refusal: list[str] = []
+
+    def attempt() -> None:
+        try:
+            os_rt.run_fifo(1)
+        except OSError as exc:
+            refusal.append(_reason(exc))
+
+    thread = threading.Thread(target=attempt)
+    thread.start()
+    thread.join()
+    return refusal[0] if refusal else None
+
+
+def _reason(exc: OSError) -> str:
+    if isinstance(exc, PermissionError):
+        return "no CAP_SYS_NICE"
+    return exc.strerror or str(exc)
