@@ -101,6 +101,7 @@ class LiveNode:
         self._backoff_ns = FIRST_BACKOFF_NS
         self._error_log = _Limiter()
         self._limit_log = _Limiter()
+        self._order_log = _Limiter()
         self.apply(core.spec)
 
     # -- what it is --------------------------------------------------------------
@@ -363,6 +364,17 @@ class LiveNode:
         elif summary is not None:
             self.emit(logging.WARNING, text)
         return text
+
+    def order_violated(self, predecessor: LiveNode) -> None:
+        """Count and log (rate limited) that this node ran before one it should follow."""
+        self.counters.order_violations += 1
+        summary = self._order_log.note(self.timeline.now_ns(), 0)
+        if summary is not None:
+            self.emit(
+                logging.WARNING,
+                f"runs before {predecessor.name}, which is not done by its deadline "
+                f"({summary.held_back + 1} times since the last message)",
+            )
 
     # -- reports -----------------------------------------------------------------
 

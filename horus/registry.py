@@ -108,6 +108,7 @@ class Registry:
             "deadline_misses": sum(each.deadline_misses for each in counters),
             "watchdog_expirations": sum(each.watchdog_expirations for each in counters),
             "skipped": sum(each.skipped for each in counters),
+            "order_violations": sum(each.order_violations for each in counters),
             "health_states": {live.name: live.health.value for live in self.in_order},
         }
 
@@ -133,6 +134,7 @@ def node_stats(live: LiveNode, now_ns: int) -> dict[str, Any]:
         "budget_overruns": counters.budget_overruns,
         "deadline_misses": counters.deadline_misses,
         "skipped": counters.skipped,
+        "order_violations": counters.order_violations,
         "dropped": live.core.dropped,
         "watchdog_expirations": counters.watchdog_expirations,
         "avg_tick_duration": timing.execution_avg_s,

@@ -109,6 +109,7 @@ class NodeCounters:
         "errors",
         "first_release_ns",
         "last_release_ns",
+        "order_violations",
         "restarts",
         "skipped",
         "span_ns",
@@ -124,6 +125,7 @@ class NodeCounters:
         self.restarts = 0
         self.budget_overruns = 0
         self.deadline_misses = 0
+        self.order_violations = 0
         self.skipped = 0
         self.watchdog_expirations = 0
         self.first_release_ns: int | None = None

@@ -46,6 +46,10 @@ class ReleaseGrid:
         after = instant_ns - self.epoch_ns + 1
         return -(-after * self._denominator // self._numerator) - 1
 
+    def has(self, instant_ns: int) -> bool:
+        """Return whether something is released at exactly this instant."""
+        return self.at(self.index_at(instant_ns)) == instant_ns
+
     def first_from(self, instant_ns: int) -> int:
         """Return the first release at or after `instant_ns`, at least 0."""
         return max(0, self.index_at(instant_ns - 1) + 1)

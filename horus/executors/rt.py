@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+from collections import deque
 
+from horus import clock
 from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
 from horus.loop.realtime import RealTime
@@ -13,43 +15,65 @@ from horus.tick_path import build_tick
 class RtThread(NodeThread):
     """Sleeps until a release, ticks, and goes on to the next one.
 
+    `idle` is the loop::
+
+        if somebody earlier in order is due at the same instant and not done:
+            sleep until that one passes the baton, or until its deadline
+        else sleep until the release
+        if late by a period or more: skip to the latest release, and count
+        tick
+        pass the baton to whoever waits for it
+
     A late node keeps its phase: it runs for its latest release at once, earlier
-    ones are skipped and counted, and the next one stays where it always was.
+    ones are skipped, and the next one stays where it always was. A frozen
+    predecessor holds a node up until its own deadline at most, and not at all
+    once it is past it: the node then runs out of order, which is counted.
     """
 
     def __init__(self, live: LiveNode, real_time: RealTime) -> None:
         """Prepare a thread that does not release yet."""
         super().__init__(live, functools.partial(real_time.enter_node_thread, live))
         self.engaged = False
+        self.predecessors: tuple[RtThread, ...] = ()
+        """The engaged nodes before this one in execution order, the nearest first."""
+        self.done_ns = clock.NEVER
+        """The release of the last tick that is over [ns]: a skipped one frees nobody."""
+        self.grid = live.grid()
+        self._waiting: deque[RtThread] = deque()
         self._run_tick = build_tick(live)
         self._timeline = live.timeline
         self._now_ns = live.timeline.now_ns
-        self._grid = live.grid()
         self._index = 0
         self._release_ns = 0
+        self._violated_ns = clock.NEVER
 
     def idle(self) -> None:
-        """Wait for the next release and run it."""
-        if not self.engaged:
+        """Wait for the next release and run it; see the class for the steps."""
+        release_ns = self._release_ns
+        if not self.engaged or release_ns >= self._timeline.end_ns:
             self.park()
             return
         now_ns = self._now_ns()
-        if self._release_ns >= self._timeline.end_ns:
-            self.park()
-            return
-        early_ns = self._release_ns - now_ns
-        if early_ns > 0:
+        for predecessor in self.predecessors:
+            if (
+                predecessor.done_ns < release_ns
+                and predecessor.grid.has(release_ns)
+                and self._wait_for_baton(predecessor, release_ns, now_ns)
+            ):
+                return
+        if release_ns > now_ns:
             # Woken early or for a job, we come back here and look again.
-            self.park(early_ns)
+            self.park(release_ns - now_ns)
             return
-        if -early_ns >= self.live.period_ns:
-            latest = self._grid.index_at(min(now_ns, self._timeline.end_ns - 1))
-            self.live.counters.skipped += latest - self._index
-            self._index = latest
-            self._release_ns = self._grid.at(latest)
-        self._run_tick(self._release_ns)
+        if now_ns - release_ns >= self.live.period_ns:
+            latest = self.grid.index_at(min(now_ns, self._timeline.end_ns - 1))
+            if latest > self._index:
+                self._skip_to(latest)
+                return
+        self._run_tick(release_ns)
         self._index += 1
-        self._release_ns = self._grid.at(self._index)
+        self._release_ns = self.grid.at(self._index)
+        self._pass_baton(release_ns)
 
     def engage(self, from_ns: int) -> None:
         """Begin with the first release at or after `from_ns` [ns]."""
@@ -58,13 +82,53 @@ class RtThread(NodeThread):
 
     def retime(self) -> None:
         """Move to the grid of the node's new rate; a release that is due is not lost to it."""
-        if self._grid != self.live.grid():
+        if self.grid != self.live.grid():
             self._join_grid(min(self._release_ns, self._now_ns()))
 
     def _join_grid(self, from_ns: int) -> None:
-        self._grid = self.live.grid()
-        self._index = self._grid.first_from(from_ns)
-        self._release_ns = self._grid.at(self._index)
+        self.grid = self.live.grid()
+        self._index = self.grid.first_from(from_ns)
+        self._release_ns = self.grid.at(self._index)
+        self._pass_baton(self._release_ns - 1)
+
+    def _skip_to(self, index: int) -> None:
+        self.live.counters.skipped += index - self._index
+        self._index = index
+        self._release_ns = self.grid.at(index)
+
+    def _wait_for_baton(self, predecessor: RtThread, release_ns: int, now_ns: int) -> bool:
+        """Sleep until a predecessor is done; return False if this node must not wait for it."""
+        limit_ns = predecessor.latest_finish_ns(release_ns)
+        if now_ns >= limit_ns:
+            self._note_violation(predecessor, release_ns)
+            return False
+        predecessor._waiting.append(self)
+        # Looked at again now that the predecessor can see us.
+        if predecessor.done_ns < release_ns:
+            self.park(limit_ns - now_ns)
+        return True
+
+    def latest_finish_ns(self, release_ns: int) -> int:
+        """Return until when others wait for this node's tick of a release [ns].
+
+        Until its deadline. A node that is past the deadline of an earlier release
+        and still ticking is not waited for at all.
+        """
+        limit_ns = min(self.live.limits.deadline_ns, self.live.period_ns)
+        context = self.live.tick_context
+        started_for_ns = context.release_ns if context.ticking else release_ns
+        return min(started_for_ns, release_ns) + limit_ns
+
+    def _note_violation(self, predecessor: RtThread, release_ns: int) -> None:
+        if self._violated_ns != release_ns:
+            self._violated_ns = release_ns
+            self.live.order_violated(predecessor.live)
+
+    def _pass_baton(self, done_ns: int) -> None:
+        """Let those run that wait for this node."""
+        self.done_ns = done_ns
+        while self._waiting:
+            self._waiting.popleft().unpark()
 
 
 class RtExecutor(ThreadExecutor[RtThread]):
@@ -74,6 +138,7 @@ class RtExecutor(ThreadExecutor[RtThread]):
         """Serve the nodes of one run."""
         super().__init__()
         self._real_time = real_time
+        self._in_order: list[RtThread] = []
 
     def make_thread(self, live: LiveNode) -> RtThread:
         """Return the node's thread, not started."""
@@ -83,6 +148,8 @@ class RtExecutor(ThreadExecutor[RtThread]):
         """Let the thread release the node."""
         live.enter_service()
         thread = self.thread_of(live)
+        self._in_order = sorted([*self._in_order, thread], key=lambda thread: thread.live.rank)
+        self._introduce()
         thread.post(functools.partial(thread.engage, from_ns))
 
     def disengage(self, live: LiveNode) -> None:
@@ -90,9 +157,17 @@ class RtExecutor(ThreadExecutor[RtThread]):
         live.leave_service()
         thread = self.thread_of(live)
         thread.engaged = False
-        thread.unpark()
+        self._in_order = [other for other in self._in_order if other is not thread]
+        self._introduce()
+        # Nobody waits any more for one that leaves.
+        thread.post(functools.partial(thread._pass_baton, clock.FOREVER_NS))
 
     def retime(self, live: LiveNode) -> None:
         """Let the thread move to the grid of the new rate."""
         thread = self.thread_of(live)
         thread.post(thread.retime)
+
+    def _introduce(self) -> None:
+        """Tell every engaged thread whom it follows."""
+        for place, thread in enumerate(self._in_order):
+            thread.predecessors = tuple(reversed(self._in_order[:place]))

@@ -24,6 +24,9 @@ _log = logging.getLogger("horus.scheduler")
 _SUPERVISOR_PRIORITY = 95
 _LOWEST_PRIORITY, _HIGHEST_PRIORITY = 50, 89
 _TIMER_SLACK_NS = 1
+_NOT_LOCKED = (
+    "mlockall not permitted (RLIMIT_MEMLOCK, no CAP_IPC_LOCK) - memory pages may be swapped"
+)
 
 
 class RealTime:
@@ -43,10 +46,12 @@ class RealTime:
             if fifo is not None:
                 self.degrade(f"SCHED_FIFO unavailable ({fifo}) - using SCHED_OTHER")
             if not os_rt.may_lock_memory():
-                self.degrade(
-                    "mlockall not permitted (RLIMIT_MEMLOCK, no CAP_IPC_LOCK) - "
-                    "memory pages may be swapped"
-                )
+                self.degrade(_NOT_LOCKED)
+
+    @property
+    def collects_garbage(self) -> bool:
+        """Whether garbage is collected by supervision instead of automatically."""
+        return self._rt
 
     def degradations(self) -> list[str]:
         """Return what was requested and refused."""
@@ -172,7 +177,7 @@ def _memory_locked(real_time: RealTime) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _garbage_frozen() -> Iterator[None]:
-    """Leave garbage to `collect_garbage` while any run wants it.
+    """Leave garbage to `supervisor.collect_garbage` while any run wants it.
 
     An automatic collection stops all threads for milliseconds in a program with
     many objects. What exists at the start is frozen: it is looked at no more.

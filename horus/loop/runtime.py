@@ -21,7 +21,7 @@ from horus.loop.executor import Executor
 from horus.loop.gil import prompt_switching
 from horus.loop.realtime import RealTime
 from horus.loop.shutdown import begin_shutdown, quiesce, shut_down
-from horus.loop.supervisor import Supervisor, report_blocked_loop
+from horus.loop.supervisor import Supervisor, collect_garbage, report_blocked_loop
 from horus.spec import ExecutionClass, NodeState
 from horus.units import NS_PER_MS, to_s
 
@@ -88,6 +88,8 @@ class Runtime:
             if not self._process_ready:
                 self._process_ready = True
                 self._resources.enter_context(self._real_time.in_process())
+                if self._real_time.collects_garbage:
+                    self._supervisor.spawn(collect_garbage)
             self._engage(set(members()), duration_ns)
             await self._until_stopped()
         finally:

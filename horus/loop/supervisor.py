@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
+import itertools
 import logging
 import sys
 import threading
@@ -12,6 +14,8 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 _log = logging.getLogger("horus.supervisor")
+
+_SECONDS_PER_FULL_COLLECTION = 60
 
 
 class Supervisor:
@@ -83,6 +87,17 @@ async def report_blocked_loop(
                 patience_s,
                 stack_of(loop_thread_id),
             )
+
+
+async def collect_garbage() -> None:
+    """Collect garbage little and often, in place of the automatic collections.
+
+    What a second has left behind is little, and so is the time for which other
+    threads have to wait. What gets old is looked at once a minute.
+    """
+    for second in itertools.count(1):
+        await asyncio.sleep(1.0)
+        gc.collect(2 if second % _SECONDS_PER_FULL_COLLECTION == 0 else 1)
 
 
 def stack_of(thread_id: int) -> str:

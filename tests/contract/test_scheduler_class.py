@@ -84,8 +84,6 @@ def test_the_scheduler_of_the_contract_can_be_created():
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        ("rt", True),
-        ("cores", [0]),
         ("watchdog_ms", 500),
         ("blackbox_mb", 16),
         ("recording", True),
@@ -98,46 +96,10 @@ def test_an_argument_whose_work_is_not_there_yet_says_so_plainly(option, value):
         Scheduler(**{option: value})
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("watchdog", 200 * ms), ("core", 0), ("priority", 80)]
-)
-def test_a_node_argument_whose_work_is_not_there_yet_says_so_plainly(option, value):
+def test_a_node_argument_whose_work_is_not_there_yet_says_so_plainly():
     """Nothing pretends: a node's argument without effect warns by the time it would count."""
-    with pytest.warns(UnavailableWarning, match=option):
-        Scheduler(deterministic=True).add(Node("motor", nothing, rate=100, **{option: value}))
-
-
-def test_requested_real_time_features_that_are_missing_are_listed():
-    """rt=True degrades gracefully: the scheduler still runs, and says what is missing."""
-    with pytest.warns(UnavailableWarning):
-        sched = Scheduler(tick_rate=100, rt=True)
-    ticks = []
-    sched.add(Node("node", lambda: ticks.append(1), rate=100))
-
-    sched.tick_once()
-    sched.stop()
-
-    assert ticks == [1]
-    assert sched.has_full_rt() is (sched.degradations() == [])
-    assert not sched.has_full_rt()
-    assert all(isinstance(text, str) and len(text) > 10 for text in sched.degradations())
-    assert {"rt_scheduling", "memory_locking", "cpu_isolation"} <= set(sched.capabilities())
-
-
-def test_pinning_and_priority_are_hints_that_are_missed_in_words():
-    """CPU pinning and priority without effect: the node runs, and degradations() names it."""
-    ticks = []
-    sched = Scheduler(tick_rate=100)
-    with pytest.warns(UnavailableWarning):
-        sched.add(Node("motor", lambda: ticks.append(1), rate=100, core=0, priority=80))
-
-    sched.tick_once()
-    sched.stop()
-
-    assert ticks == [1]
-    assert sched.get_node_stats("motor")["priority"] == 80
-    assert not sched.has_full_rt()
-    assert len([text for text in sched.degradations() if "motor" in text]) == 2
+    with pytest.warns(UnavailableWarning, match="watchdog"):
+        Scheduler(deterministic=True).add(Node("motor", nothing, rate=100, watchdog=200 * ms))
 
 
 def test_full_rt_is_true_when_nothing_was_requested():
