@@ -310,6 +310,8 @@ class LiveNode:
 
     def plan_restart(self) -> None:
         """Wait for the back-off, which doubles while the node keeps failing."""
+        if not self.initialized:
+            return  # shut down meanwhile: a stuck tick has come back too late
         now_ns = self.timeline.now_ns()
         if now_ns - self._restart_at_ns > LONGEST_BACKOFF_NS:
             self._backoff_ns = FIRST_BACKOFF_NS
@@ -321,6 +323,8 @@ class LiveNode:
 
     def restarted(self, success: bool) -> None:
         """Resume after `init()` ran again, or wait for the next attempt."""
+        if not self.initialized:
+            return
         if success:
             self.counters.restarts += 1
             self.state = NodeState.RUNNING
@@ -418,8 +422,8 @@ class _Nobody:
 class EventTick:
     """Sees to it that a tick of an event node uses up its message, exactly one.
 
-    Also if the tick does not ask for it. A node that was to restart first and
-    could not has not ticked: its message waits.
+    Also if the tick does not ask for it. A node that has not ticked because it was
+    to restart first, or is out of service, leaves its message to wait.
     """
 
     def __init__(self, live: LiveNode) -> None:
@@ -433,7 +437,8 @@ class EventTick:
     def settle(self) -> None:
         """Discard the message after the tick, if it was due and is still there."""
         live = self._live
-        if live.state is NodeState.RESTARTING and live.counters.ticks == self._ticks:
+        waits = live.retired or live.state is NodeState.RESTARTING
+        if waits and live.counters.ticks == self._ticks:
             return
         if self._trigger.received == self._received:
             self._trigger.discard()

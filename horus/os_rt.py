@@ -79,12 +79,15 @@ class TimerFd:
 def run_fifo(priority: int) -> None:
     """Schedule the calling thread with SCHED_FIFO at `priority`, 1 to 99.
 
+    Threads and processes that it starts get ordinary scheduling: a driver's helper
+    thread must not outrank the machine by inheritance.
+
     Raises:
         OSError: Not permitted (no CAP_SYS_NICE), or not on this platform.
     """
     if not hasattr(os, "sched_setscheduler"):
         raise OSError("SCHED_FIFO is not available on this platform")
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
 
 
 def affinity() -> set[int]:

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 
 from horus import clock, logs
 from horus.clock import MonotonicClock, SimClock, Timeline
@@ -60,6 +59,7 @@ class Session:
         self.status = "idle"
         self._lock = threading.Lock()
         self._open = False
+        self._closing = False
         self._idle = threading.Event()
         self._idle.set()
         self._driving_thread: int | None = None
@@ -100,7 +100,7 @@ class Session:
             else:
                 runtime = self._start_runtime()
                 members = self._all if only is None else lambda: only
-                self._private_loop().run(runtime.play(members, duration_ns))
+                self._private_loop().run(runtime.play(members, duration_ns, final=not keeps_open))
 
     async def arun(self, duration_ns: int | None) -> None:
         """Run on the running event loop until stopped, cancelled, or for a time [ns].
@@ -114,7 +114,7 @@ class Session:
                 return
             runtime = self._start_runtime()
             try:
-                await runtime.play(self._all, duration_ns)
+                await runtime.play(self._all, duration_ns, final=True)
             except asyncio.CancelledError:
                 self.control.request_stop("cancelled")
                 raise
@@ -140,11 +140,15 @@ class Session:
             self.status = "stopped"
 
     def close_if_idle(self) -> None:
-        """Shut the nodes down, unless they are being run."""
+        """Shut the nodes down, unless they are being run or shut down already."""
         with self._lock:
-            if self.running:
+            if self.running or self._closing:
                 return
+            self._closing = True
+        try:
             self._close()
+        finally:
+            self._closing = False
 
     def wait_until_idle(self) -> None:
         """Wait for the end of a run on another thread."""
@@ -161,10 +165,11 @@ class Session:
 
     def joined(self, live: LiveNode) -> None:
         """Let a node that was added take part: now, or from the next run or step on."""
-        if self.running and self._runtime is not None:
-            self._runtime.add(live)
-        elif self.running and self._stepper is not None:
-            self._stepper.add(live)
+        runtime, stepper = self._runtime, self._stepper
+        if self.running and runtime is not None:
+            runtime.add(live)
+        elif self.running and stepper is not None:
+            stepper.add(live)
 
     def retimed(self, live: LiveNode) -> None:
         """Adopt a node's changed rate."""
@@ -179,10 +184,11 @@ class Session:
             ShutdownTimeout: Its tick or its `shutdown()` did not end in time.
         """
         live.removed = True
-        if self._runtime is not None:
-            self._wait_for(live, self._runtime)
-        if self._stepper is not None:
-            self._stepper.remove(live)
+        runtime, stepper = self._runtime, self._stepper
+        if runtime is not None:
+            self._wait_for(live, runtime)
+        if stepper is not None:
+            stepper.remove(live)
         if not live.initialized and not live.ticking:
             live.core.disconnect()
 
@@ -333,7 +339,7 @@ class Session:
         removed = runtime.remove(live)
         if not self.running and not removed.done():
             # Between two runs the loop stands still unless we run it.
-            self._private_loop().run(_done(removed))
+            self._private_loop().run(runtime.depart(removed))
         if removed.done() or runtime.is_home(live):
             return
         timeout_s = 3 * to_s(self._spec.shutdown_timeout_ns)
@@ -343,15 +349,12 @@ class Session:
             raise ShutdownTimeout(live.name, timeout_s) from None
 
     def _end_run(self) -> None:
-        if self._runtime is not None:
-            self._runtime.request_stop()
+        runtime = self._runtime
+        if runtime is not None:
+            runtime.request_stop()
 
     def _stopping(self) -> bool:
         return self.control.stopping
-
-
-async def _done(future: Future[None]) -> None:
-    await asyncio.wrap_future(future)
 
 
 def _loop_factory(kind: str) -> Callable[[], asyncio.AbstractEventLoop]:

@@ -140,6 +140,8 @@ def _settle(
     error: BaseException | None,
 ) -> bool:
     """Count what went wrong, decide what follows and do it; see `_build_finish`."""
+    if live.abandoned:
+        return False  # it was shut down without us: nothing may follow
     counters = live.counters
     outcome = Outcome(max(0, over_budget_ns), max(0, past_deadline_ns), error is not None)
     action = decide(

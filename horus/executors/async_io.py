@@ -112,9 +112,8 @@ class AsyncIoExecutor(LoopExecutor):
         live.enter_service()
         self._cycle.add(live, self._release, from_ns)
 
-    def disengage(self, live: LiveNode) -> None:
-        """Release the node no more and cancel its tick in progress: sleeps end at shutdown."""
-        super().disengage(live)
+    def cancel(self, live: LiveNode) -> None:
+        """Cancel the tick in progress."""
         self._tasks.cancel(live)
 
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:

@@ -37,6 +37,9 @@ class LoopExecutor:
         live.leave_service()
         self._cycle.remove(live)
 
+    def cancel(self, live: LiveNode) -> None:
+        """Do nothing: a plain tick cannot be cut short."""
+
     def dismiss(self, live: LiveNode) -> None:
         """Do nothing: the loop's thread is not this executor's to end."""
 

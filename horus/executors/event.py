@@ -42,6 +42,10 @@ class EventExecutor:
         """Stop listening."""
         self._home_of(live).disengage(live)
 
+    def cancel(self, live: LiveNode) -> None:
+        """Cut a tick in progress short, if it is async."""
+        self._home_of(live).cancel(live)
+
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
         """Run a callback in the node's home."""
         return self._home_of(live).call(live, phase)
@@ -179,9 +183,12 @@ class LoopEventExecutor(LoopExecutor):
         self._runners[live].listen()
 
     def disengage(self, live: LiveNode) -> None:
-        """Stop listening; an async tick in progress is cancelled."""
+        """Stop listening."""
         super().disengage(live)
         self._runners[live].ignore()
+
+    def cancel(self, live: LiveNode) -> None:
+        """Cancel an async tick in progress."""
         self._tasks.cancel(live)
 
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:

@@ -111,6 +111,9 @@ class ThreadExecutor(ABC, Generic[T]):
         """Run a callback on the node's thread after what is in progress."""
         return self._threads[live].call(phase)
 
+    def cancel(self, live: LiveNode) -> None:
+        """Do nothing: a plain tick cannot be cut short."""
+
     def is_home(self, live: LiveNode) -> bool:
         """Return whether the calling thread is the node's."""
         return threading.current_thread() is self._threads.get(live)

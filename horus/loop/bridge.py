@@ -22,7 +22,8 @@ class Bridge:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         """Attach to `loop`, whose thread this must be."""
         self.loop = loop
-        self.thread_id = threading.get_ident()
+        self.thread_id: int | None = threading.get_ident()
+        """The thread that runs the loop; None while it stands still."""
         self._calls: deque[Callable[[], object]] = deque()
         self._awake = False
         self._fd: int | None = None
@@ -34,6 +35,14 @@ class Bridge:
     def on_loop_thread(self) -> bool:
         """Return whether the calling thread is the loop's."""
         return threading.get_ident() == self.thread_id
+
+    def attach(self) -> None:
+        """Take note that the calling thread runs the loop from now on."""
+        self.thread_id = threading.get_ident()
+
+    def detach(self) -> None:
+        """Take note that nobody runs the loop: all calls wait until somebody does."""
+        self.thread_id = None
 
     def run(self, call: Callable[[], object]) -> None:
         """Run `call` on the loop's thread: at once when already there, else soon.

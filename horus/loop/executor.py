@@ -35,6 +35,12 @@ class Executor(Protocol):
         Thread: loop.
         """
 
+    def cancel(self, live: LiveNode) -> None:
+        """Cut a tick in progress short, where that is possible: it awaits something.
+
+        Thread: loop.
+        """
+
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
         """Run a callback in the node's home once no tick is in progress.
 

@@ -222,24 +222,29 @@ class _IdleSelector(selectors.DefaultSelector):
         return []
 
     def _waits_for_sockets(self, loop: asyncio.AbstractEventLoop) -> list[asyncio.Future[Any]]:
-        """Return what tasks wait for that may be a socket: neither a sleep nor another task."""
+        """Return what tasks wait for that may be a socket."""
         waits = []
         for task in asyncio.all_tasks(loop):
             future = getattr(task, "_fut_waiter", None)
-            if future is None or isinstance(future, asyncio.Task) or _sleeps(task.get_coro()):
+            if future is None or isinstance(future, asyncio.Task) or _waits_within(task.get_coro()):
                 continue
             if future not in self._given_up:
                 waits.append(future)
         return waits
 
 
-def _sleeps(coroutine: Any) -> bool:
-    """Return whether a coroutine is, at the bottom of its calls, in `asyncio.sleep`."""
-    while coroutine is not None:
-        if getattr(coroutine, "cr_code", None) is _SLEEP:
-            return True
-        coroutine = getattr(coroutine, "cr_await", None)
-    return False
+def _waits_within(coroutine: Any) -> bool:
+    """Return whether a coroutine waits for a timer, a lock, a queue or a task, not for a socket.
+
+    At the bottom of its calls it is then in a module of asyncio that deals with these.
+    """
+    inner = coroutine
+    while (below := getattr(inner, "cr_await", None)) is not None and hasattr(below, "cr_code"):
+        inner = below
+    code = getattr(inner, "cr_code", None)
+    return code is not None and code.co_filename in _WAITING_ROOMS
 
 
-_SLEEP = asyncio.sleep.__code__
+_WAITING_ROOMS = {
+    module.__file__ for module in (asyncio.locks, asyncio.queues, asyncio.tasks, asyncio.timeouts)
+}

@@ -151,6 +151,7 @@ _process_lock = threading.Lock()
 _locked_by = 0
 _frozen_by = 0
 _collected_before = True
+_thaws = True
 
 
 @contextlib.contextmanager
@@ -164,7 +165,8 @@ def _memory_locked(real_time: RealTime) -> Iterator[None]:
                 os_rt.lock_memory()
             except OSError as exc:
                 granted = False
-                real_time.degrade(f"mlockall failed ({_reason(exc)}) - memory pages may be swapped")
+                failed = f"mlockall failed ({exc.strerror}) - memory pages may be swapped"
+                real_time.degrade(failed if os_rt.may_lock_memory() else _NOT_LOCKED)
         _locked_by += granted
     try:
         yield
@@ -182,11 +184,13 @@ def _garbage_frozen() -> Iterator[None]:
     An automatic collection stops all threads for milliseconds in a program with
     many objects. What exists at the start is frozen: it is looked at no more.
     """
-    global _frozen_by, _collected_before
+    global _frozen_by, _collected_before, _thaws
     with _process_lock:
         if _frozen_by == 0:
             _collected_before = gc.isenabled()
             gc.collect()
+            # Frozen by the application: it stays so, and is not ours to thaw.
+            _thaws = gc.get_freeze_count() == 0
             gc.freeze()
             gc.disable()
         _frozen_by += 1
@@ -196,7 +200,8 @@ def _garbage_frozen() -> Iterator[None]:
         with _process_lock:
             _frozen_by -= 1
             if _frozen_by == 0:
-                gc.unfreeze()
+                if _thaws:
+                    gc.unfreeze()
                 if _collected_before:
                     gc.enable()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import threading
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Mapping
@@ -61,8 +62,6 @@ class Runtime:
         self._stuck: set[LiveNode] = set()
         self._joining: deque[LiveNode] = deque()
         self._playing = False
-        self._switches_promptly = False
-        self._process_ready = False
         self._closing = False
         self._stop_requested = False
         self._reacted = threading.Event()
@@ -74,33 +73,45 @@ class Runtime:
         self._over = False
         self._notes: deque[Callable[[], None]] = deque()
 
-    async def play(self, members: Members, duration_ns: int | None) -> None:
+    async def play(self, members: Members, duration_ns: int | None, *, final: bool) -> None:
         """Initialise the nodes that are new, and tick until stopped or for a time.
 
         Args:
             members: Tells the nodes that take part.
             duration_ns: How long to tick [ns]; None until stopped.
+            final: Whether `close` comes next, so that async ticks need not end in peace.
         """
-        if self._bridge is None:
-            self._open()
+        bridge = self._bridge or self._open()
+        bridge.attach()
         try:
-            await self._initialize(members())
-            if not self._process_ready:
-                self._process_ready = True
-                self._resources.enter_context(self._real_time.in_process())
-                if self._real_time.collects_garbage:
-                    self._supervisor.spawn(collect_garbage)
-            self._engage(set(members()), duration_ns)
-            await self._until_stopped()
+            with contextlib.ExitStack() as while_playing:
+                await self._initialize(members())
+                while_playing.enter_context(self._real_time.in_process())
+                if any(live.spec.execution_class is ExecutionClass.RT for live in self._homes):
+                    while_playing.enter_context(prompt_switching())
+                self._engage(set(members()), duration_ns)
+                await self._until_stopped()
         finally:
             self._playing = False
             self._reacted.set()
             self._timeline.pause()
-            await uninterrupted(self._pause)
+            await uninterrupted(functools.partial(self._pause, cancel=final))
+            bridge.detach()
+
+    async def depart(self, removed: Future[None]) -> None:
+        """Run the loop until a node that was removed between two plays has left."""
+        if self._bridge is not None:
+            self._bridge.attach()
+            try:
+                await asyncio.wrap_future(removed)
+            finally:
+                self._bridge.detach()
 
     async def close(self) -> None:
         """Bring every node to rest in order, and give everything back."""
         self._closing = True
+        if self._bridge is not None:
+            self._bridge.attach()
         try:
             await uninterrupted(self._shut_down)
         finally:
@@ -127,10 +138,11 @@ class Runtime:
             live.leave_service()
         self._post(self._stop_event.set)
         bridge = self._bridge
-        if bridge is not None and not bridge.on_loop_thread():
+        thread_id = None if bridge is None else bridge.thread_id
+        if thread_id not in (None, threading.get_ident()):
             self._supervisor.spawn(
                 lambda: report_blocked_loop(
-                    bridge.thread_id, self._reacted, to_s(self._shutdown_timeout_ns)
+                    thread_id, self._reacted, to_s(self._shutdown_timeout_ns)
                 )
             )
 
@@ -204,7 +216,7 @@ class Runtime:
 
     # -- the run ------------------------------------------------------------------
 
-    def _open(self) -> None:
+    def _open(self) -> Bridge:
         """Acquire what runs need; the stack gives it back in reverse."""
         # anyio loads its backend on first use, which takes tens of milliseconds:
         # now, not after the first release.
@@ -222,6 +234,9 @@ class Runtime:
             self._bridge = bridge
         while self._notes:
             self._notes.popleft()()
+        if self._real_time.collects_garbage:
+            self._supervisor.spawn(collect_garbage)
+        return bridge
 
     async def _initialize(self, lives: Iterable[LiveNode]) -> None:
         """Call `init()` of each new node in order; one that fails is left out, others go on."""
@@ -235,9 +250,6 @@ class Runtime:
             return
         home = self._executors[live.spec.execution_class]
         self._homes[live] = home
-        if live.spec.execution_class is ExecutionClass.RT and not self._switches_promptly:
-            self._resources.enter_context(prompt_switching())
-            self._switches_promptly = True
         home.adopt(live)
         if live.state is not NodeState.UNINITIALIZED:
             return
@@ -292,6 +304,7 @@ class Runtime:
             removed.set_result(None)
             return
         home.disengage(live)
+        home.cancel(live)
 
         def finish(_: object) -> None:
             live.stopped()
@@ -319,10 +332,13 @@ class Runtime:
         if home is not None:
             home.dismiss(live)
 
-    async def _pause(self) -> None:
-        self._stuck = await quiesce(self._homes, self._shutdown_timeout_ns)
+    async def _pause(self, *, cancel: bool) -> None:
+        self._stuck = await quiesce(self._homes, self._shutdown_timeout_ns, cancel=cancel)
 
     async def _shut_down(self) -> None:
+        if self._stuck:
+            # It may have come back since.
+            await self._pause(cancel=True)
         await shut_down(self._homes, self._stuck, self._shutdown_timeout_ns)
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:

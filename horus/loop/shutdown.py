@@ -14,14 +14,18 @@ from horus.loop.executor import Executor
 from horus.units import to_s
 
 
-async def quiesce(homes: Mapping[LiveNode, Executor], timeout_ns: int) -> set[LiveNode]:
-    """End all ticking; return the nodes whose tick in progress does not end in time.
+async def quiesce(
+    homes: Mapping[LiveNode, Executor], timeout_ns: int, *, cancel: bool
+) -> set[LiveNode]:
+    """End all ticking; return the nodes whose home is not free in time.
 
-    No further tick begins, anywhere; the ticks in progress have `timeout_ns`,
-    all of them together.
+    No further tick begins, anywhere; what is in progress has `timeout_ns`, all of it
+    together. With `cancel`, async ticks are cut short.
     """
     for live, home in homes.items():
         home.disengage(live)
+        if cancel:
+            home.cancel(live)
     waits = {asyncio.wrap_future(home.call(live, None)): live for live, home in homes.items()}
     if not waits:
         return set()
@@ -66,7 +70,7 @@ def begin_shutdown(live: LiveNode, home: Executor | None) -> Future[bool]:
         live.abandoned = True
         live.emit(
             logging.ERROR,
-            "its last tick does not end; it is left behind, and shutdown() runs elsewhere",
+            "its last callback does not end; it is left behind, and shutdown() runs elsewhere",
         )
     if not live.claim_shutdown():
         nothing: Future[bool] = Future()

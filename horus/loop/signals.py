@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import logging
 import os
@@ -51,12 +52,21 @@ def stop_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
 
 
 def _force_exit(number: int) -> None:
-    """End the process, with what the log still has to say if that can be said."""
-    # First the end, which nothing below can hold up: stderr may block.
-    threading.Timer(_LAST_WORDS_S, os._exit, [128 + number]).start()
-    threading.Thread(
-        target=_log.critical,
-        args=("%s again: exiting at once", signal.Signals(number).name),
-        daemon=True,
-    ).start()
-    threading.Event().wait()
+    """End the process, with what the log still has to say if that can be said.
+
+    The end comes first, and from C: stderr may block, and whatever the signal has
+    interrupted may hold any lock.
+    """
+    _thread.start_new_thread(_end_process, (128 + number,))
+    _thread.start_new_thread(
+        _log.critical, ("%s again: exiting at once", signal.Signals(number).name)
+    )
+    while True:
+        signal.pause()
+
+
+def _end_process(code: int) -> None:
+    pause = _thread.allocate_lock()
+    pause.acquire()
+    pause.acquire(True, _LAST_WORDS_S)
+    os._exit(code)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
+from concurrent.futures import Future
 
 from horus import clock
 from horus.clock import Timeline
@@ -170,6 +171,9 @@ class Stepper:
             self._plain[live] = build_tick(live)
         if live.state is NodeState.UNINITIALIZED:
             self.run_phase(live, "init")
+        if live.removed:
+            self.shut_down_one(live)
+            return
         live.enter_service()
         self._put_in_order((*self._in_order, live))
 
@@ -191,19 +195,26 @@ class Stepper:
 
         Asked from another thread than the one that drives, wait for that one.
         """
-        made = threading.Event()
+        made: Future[None] = Future()
 
         def make() -> None:
-            change()
-            made.set()
+            try:
+                change()
+            except BaseException as exc:
+                made.set_exception(exc)
+            else:
+                made.set_result(None)
 
+        context = clock.current.get()
+        # In a callback of ours we are at home, whatever thread it runs on.
+        inside = context is not None and context.timeline is self.timeline
         with self._lock:
-            elsewhere = self._driver not in (None, threading.get_ident())
+            elsewhere = not inside and self._driver not in (None, threading.get_ident())
             deferred = elsewhere or (self._depth and (live.is_async or live.ticking))
             if deferred:
                 self._changes.append(make)
         if elsewhere:
-            made.wait()
+            made.result()
         elif not deferred:
             change()
 

@@ -9,6 +9,7 @@ import resource
 import subprocess
 import sys
 import textwrap
+import threading
 import weakref
 
 import pytest
@@ -32,7 +33,7 @@ needs_permission = pytest.mark.skipif(not permitted(), reason="needs CAP_SYS_NIC
 def policy() -> tuple[int, int, set[int]]:
     """Return the calling thread's policy, priority and cores."""
     return (
-        os.sched_getscheduler(0),
+        os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK,
         os.sched_getparam(0).sched_priority,
         os.sched_getaffinity(0),
     )
@@ -60,6 +61,23 @@ def test_rt_enables_sched_fifo_for_all_rt_class_nodes():
     assert seen["best"][0] == os.SCHED_OTHER
     assert sched.degradations() == []
     assert sched.has_full_rt()
+
+
+@needs_permission
+def test_what_a_node_starts_does_not_inherit_its_priority():
+    """A driver's helper thread or a subprocess gets ordinary scheduling, not the motor's."""
+    seen = []
+
+    def tick(node):
+        helper = threading.Thread(target=lambda: seen.append(policy()[0]))
+        helper.start()
+        helper.join()
+        node.request_stop()
+
+    sched = Scheduler(rt=True)
+    sched.add(Node("motor", tick, rate=100))
+    sched.run(5.0)
+    assert seen == [os.SCHED_OTHER]
 
 
 @needs_permission
