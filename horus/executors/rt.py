@@ -26,8 +26,9 @@ class RtThread(NodeThread):
 
     A late node keeps its phase: it runs for its latest release at once, earlier
     ones are skipped, and the next one stays where it always was. A frozen
-    predecessor holds a node up until its own deadline at most, and not at all
-    once it is past it: the node then runs out of order, which is counted.
+    predecessor holds a node up until its own deadline at most, or until the node
+    could no longer meet its own, and not at all once it is past it: the node then
+    runs out of order, which is counted.
     """
 
     def __init__(self, live: LiveNode, real_time: RealTime) -> None:
@@ -76,9 +77,13 @@ class RtThread(NodeThread):
         self._pass_baton(release_ns)
 
     def engage(self, from_ns: int) -> None:
-        """Begin with the first release at or after `from_ns` [ns]."""
+        """Begin with the first release at or after `from_ns` [ns].
+
+        Thread: loop, while this one rests: those who follow look at the grid at once.
+        """
         self._join_grid(from_ns)
         self.engaged = True
+        self.unpark()
 
     def retime(self) -> None:
         """Move to the grid of the node's new rate; a release that is due is not lost to it."""
@@ -98,15 +103,31 @@ class RtThread(NodeThread):
 
     def _wait_for_baton(self, predecessor: RtThread, release_ns: int, now_ns: int) -> bool:
         """Sleep until a predecessor is done; return False if this node must not wait for it."""
-        limit_ns = predecessor.latest_finish_ns(release_ns)
+        limit_ns = min(predecessor.latest_finish_ns(release_ns), self._latest_start_ns(release_ns))
         if now_ns >= limit_ns:
             self._note_violation(predecessor, release_ns)
             return False
-        predecessor._waiting.append(self)
+        if self not in predecessor._waiting:
+            predecessor._waiting.append(self)
         # Looked at again now that the predecessor can see us.
         if predecessor.done_ns < release_ns:
             self.park(limit_ns - now_ns)
         return True
+
+    def _latest_start_ns(self, release_ns: int) -> int:
+        """Return how long this node can wait and still meet its deadline [ns].
+
+        With a budget that was given, until the deadline less the budget. One that
+        was derived, 80 % of the period, is an upper bound rather than an estimate:
+        then the other 20 % are kept back.
+        """
+        spec = self.live.spec
+        if spec.budget_given and spec.budget_ns is not None:
+            reserve_ns = spec.budget_ns
+        else:
+            reserve_ns = self.live.period_ns // 5
+        limit_ns = min(self.live.limits.deadline_ns, self.live.period_ns)
+        return release_ns + max(0, limit_ns - reserve_ns)
 
     def latest_finish_ns(self, release_ns: int) -> int:
         """Return until when others wait for this node's tick of a release [ns].
@@ -148,9 +169,9 @@ class RtExecutor(ThreadExecutor[RtThread]):
         """Let the thread release the node."""
         live.enter_service()
         thread = self.thread_of(live)
+        thread.engage(from_ns)
         self._in_order = sorted([*self._in_order, thread], key=lambda thread: thread.live.rank)
         self._introduce()
-        thread.post(functools.partial(thread.engage, from_ns))
 
     def disengage(self, live: LiveNode) -> None:
         """Let the thread begin no further tick."""

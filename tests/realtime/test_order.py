@@ -63,6 +63,19 @@ def test_nodes_released_together_run_in_order(rt: bool, busy: bool) -> None:
     assert watch.out_of_order < 0.05 * watch.motor_ticks
 
 
+def test_a_slow_predecessor_costs_a_fast_node_no_release() -> None:
+    """A LiDAR that works 10 ms, within its budget, does not starve the motor after it."""
+    ticks = []
+    scheduler = Scheduler()
+    scheduler.add(Node("lidar", lambda: time.sleep(0.01), rate=40, order=10))
+    scheduler.add(Node("motor", lambda: ticks.append(1), rate=500, order=70))
+    scheduler.run(1.0)
+    stats = scheduler.get_node_stats("motor")
+    assert len(ticks) > 400
+    # Once for each of the LiDAR's releases, the motor cannot wait for it.
+    assert 20 <= stats["order_violations"] <= 60
+
+
 def test_a_frozen_predecessor_is_isolated_not_contagious() -> None:
     """A node waits for its predecessor until that one's deadline, then runs, and says so."""
     watch = Watch(freeze_at=200)
