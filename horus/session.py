@@ -60,6 +60,7 @@ class Session:
         self._lock = threading.Lock()
         self._open = False
         self._closing = False
+        self._stepping = False
         self._idle = threading.Event()
         self._idle.set()
         self._driving_thread: int | None = None
@@ -126,9 +127,11 @@ class Session:
     def step(self, only: list[LiveNode] | None) -> None:
         """Run one cycle on the calling thread; the nodes stay initialised."""
         self._take_charge()
+        self._stepping = True
         try:
             self._open_stepper().cycle(only)
         finally:
+            self._stepping = False
             self._hand_back(keeps_open=True)
 
     def stop(self, reason: str) -> None:
@@ -185,7 +188,8 @@ class Session:
         """
         live.removed = True
         runtime, stepper = self._runtime, self._stepper
-        if runtime is not None:
+        # While a step is taken, a runtime stands still, and the stepper sees to it.
+        if runtime is not None and not (self.running and self._stepping):
             self._wait_for(live, runtime)
         if stepper is not None:
             stepper.remove(live)

@@ -65,6 +65,7 @@ ATOMS: frozenset[type] = frozenset(
 
 _all_atoms = ATOMS.issuperset
 _encode = msgspec.msgpack.Encoder().encode
+_SMALL_DICT = 8
 _LONG_LIST = 16
 _MSGPACK_FLOAT64 = b"\xcb"
 _MSGPACK_FLOAT64_SIZE = 9
@@ -118,7 +119,7 @@ def freeze(value: Any, depth: int = 0) -> Frozen:
 
 
 def _freeze_dict(value: dict[Any, Any], depth: int) -> Frozen:
-    if _all_atoms(map(type, itertools.chain(value, value.values()))):
+    if _is_flat(value):
         return value.copy(), dict.copy
     if not _all_immutable(value, depth):
         return _freeze_deep(value, depth)
@@ -132,6 +133,17 @@ def _freeze_dict(value: dict[Any, Any], depth: int) -> Frozen:
         if thaw is not None:
             thaws.append((key, thaw))
     return payload, functools.partial(_thaw_items, tuple(thaws)) if thaws else dict.copy
+
+
+def _is_flat(value: dict[Any, Any]) -> bool:
+    """Return whether keys and values are all atoms."""
+    if len(value) > _SMALL_DICT:
+        return _all_atoms(map(type, itertools.chain(value, value.values())))
+    # For a few items a loop is faster than setting up the chain.
+    for key, item in value.items():
+        if type(item) not in ATOMS or type(key) not in ATOMS:
+            return False
+    return True
 
 
 def _freeze_list(value: list[Any], depth: int) -> Frozen:

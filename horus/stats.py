@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from horus.units import to_s
@@ -37,23 +35,29 @@ class TickTimes:
 
     def __init__(self) -> None:
         """Start empty."""
-        # Arrays, not lists: a collector that walks thousands of references per node
-        # stops a program of many nodes for tens of milliseconds.
-        self._executions = array("Q", bytes(8 * (_BUCKETS + 1)))
-        self._latencies = array("Q", bytes(8 * (_BUCKETS + 1)))
+        # Sparse: a collector that walks thousands of references per node stops a
+        # program of many nodes for tens of milliseconds.
+        self._executions: dict[int, int] = {}
+        self._latencies: dict[int, int] = {}
         self.execution_total_ns = self.execution_max_ns = 0
         self.latency_total_ns = self.latency_max_ns = 0
 
     def add(self, execution_ns: int, latency_ns: int) -> None:
         """Count one tick; durations are not negative."""
-        if execution_ns < _FINE_LIMIT_NS:
-            self._executions[execution_ns >> _FINE_SHIFT] += 1
-        else:
-            self._executions[_bucket(execution_ns)] += 1
-        if latency_ns < _FINE_LIMIT_NS:
-            self._latencies[latency_ns >> _FINE_SHIFT] += 1
-        else:
-            self._latencies[_bucket(latency_ns)] += 1
+        bucket = execution_ns >> _FINE_SHIFT
+        if bucket >= _MEDIUM_OFFSET:
+            bucket = _bucket(execution_ns)
+        try:
+            self._executions[bucket] += 1
+        except KeyError:
+            self._executions[bucket] = 1
+        bucket = latency_ns >> _FINE_SHIFT
+        if bucket >= _MEDIUM_OFFSET:
+            bucket = _bucket(latency_ns)
+        try:
+            self._latencies[bucket] += 1
+        except KeyError:
+            self._latencies[bucket] = 1
         self.execution_total_ns += execution_ns
         self.latency_total_ns += latency_ns
         if execution_ns > self.execution_max_ns:
@@ -77,13 +81,14 @@ def _bucket(duration_ns: int) -> int:
     return min(_COARSE_OFFSET + (duration_ns >> _COARSE_SHIFT), _BUCKETS)
 
 
-def _quantile_ns(buckets: Sequence[int], fraction: float) -> int:
-    wanted = fraction * sum(buckets)
+def _quantile_ns(buckets: dict[int, int], fraction: float) -> int:
+    counts = sorted(buckets.copy().items())  # a copy: the node goes on ticking
+    wanted = fraction * sum(count for _, count in counts)
     seen = 0
-    for index, count in enumerate(buckets):
+    for bucket, count in counts:
         seen += count
-        if count and seen >= wanted:
-            return _upper_edge_ns(index)
+        if seen >= wanted:
+            return _upper_edge_ns(bucket)
     return 0
 
 

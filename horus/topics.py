@@ -266,7 +266,9 @@ class Topic:
             self._accepted = (int, float) if kind is float else (kind,)
 
     def accepts(self, message: Any) -> bool:
-        """Return whether `message` is of the declared type; an int is a fine float."""
+        """Return whether `message` is of the declared type: an int is a fine float, a bool not."""
+        if isinstance(message, bool) and self.type is float:
+            return False
         return isinstance(message, self._accepted)
 
     def publisher(self, owner: str) -> Publisher:

@@ -115,7 +115,7 @@ class EventThread(NodeThread):
     def idle(self) -> None:
         """Wait for a message and tick for it."""
         arrivals = self.arrivals
-        if not self.engaged or not arrivals.trigger.queue:
+        if not self.engaged or self.live.retired or not arrivals.trigger.queue:
             self.park()
             return
         delay_ns = self.live.resume_after_ns()
