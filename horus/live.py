@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from horus import clock
 from horus.clock import TickContext, Timeline
+from horus.core import core_of
 from horus.errors import NodeError
-from horus.node import Node, core_of
+from horus.ratelimit import Limiter
 from horus.spec import ExecutionClass, FailurePolicy, Health, NodeSpec, NodeState
 from horus.stats import NodeCounters, NodeTiming
 from horus.timing import ReleaseGrid
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 NO_LIMIT_NS = 1 << 62
 FIRST_BACKOFF_NS = 100 * NS_PER_MS
 LONGEST_BACKOFF_NS = 5 * NS_PER_S
-_LONGEST_SILENCE_NS = 32 * NS_PER_S
 
 
 class Control(Protocol):
@@ -69,7 +69,7 @@ class LiveNode:
     single attributes, or set `gated` and `retired`, which are only ever looked at.
     """
 
-    def __init__(self, node: Node, timeline: Timeline, control: Control, sequence: int) -> None:
+    def __init__(self, node: object, timeline: Timeline, control: Control, sequence: int) -> None:
         """Put `node` into service as the `sequence`-th node added."""
         self.node = node
         self.core = core = core_of(node)
@@ -99,9 +99,9 @@ class LiveNode:
         self._claims = threading.Lock()
         self._restart_at_ns = 0
         self._backoff_ns = FIRST_BACKOFF_NS
-        self._error_log = _Limiter()
-        self._limit_log = _Limiter()
-        self._order_log = _Limiter()
+        self._error_log = Limiter()
+        self._limit_log = Limiter()
+        self._order_log = Limiter()
         self.apply(core.spec)
 
     # -- what it is --------------------------------------------------------------
@@ -456,39 +456,3 @@ def being_cancelled() -> bool:
     """Return whether the current task was asked to end, as opposed to code that raises at will."""
     task = asyncio.current_task()
     return task is not None and task.cancelling() > 0
-
-
-class _Limiter:
-    """Lets a message through now and then, ever more rarely while the trouble lasts."""
-
-    def __init__(self) -> None:
-        self._last_ns = 0
-        self._pause_ns = 0
-        self._held_back = 0
-        self._worst = 0
-
-    def note(self, now_ns: int, size: int) -> Summary | None:
-        """Return what to log now, or None to hold it back."""
-        self._worst = max(self._worst, size)
-        waited_ns = now_ns - self._last_ns
-        if waited_ns < self._pause_ns:
-            self._held_back += 1
-            return None
-        if waited_ns > 2 * self._pause_ns:
-            self._pause_ns = 0
-        summary = Summary(self._held_back, self._worst, waited_ns)
-        self._pause_ns = min(max(NS_PER_S, 2 * self._pause_ns), _LONGEST_SILENCE_NS)
-        self._last_ns = now_ns
-        self._held_back = self._worst = 0
-        return summary
-
-
-class Summary(NamedTuple):
-    """What a message stands for besides itself."""
-
-    held_back: int
-    """Occurrences since the last message that were not logged."""
-    worst: int
-    """The largest size among them and this one."""
-    period_ns: int
-    """Time since the last message [ns]."""

@@ -9,9 +9,10 @@ from types import TracebackType
 from typing import Any, Self
 
 from horus import unavailable
+from horus.core import NodeCore, core_of
 from horus.errors import ConfigError, StateError
 from horus.loop.realtime import capabilities
-from horus.node import Node, NodeCore, core_of
+from horus.node import Node
 from horus.ports import DEFAULT_CAPACITY
 from horus.registry import node_stats
 from horus.session import Session
