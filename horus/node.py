@@ -77,9 +77,11 @@ class Node:
                 tick raises. None: log with traceback, count, keep ticking.
             compute: True runs the node on a worker thread, for CPU-heavy work.
             on: Tick once per message of this topic, instead of at a rate.
-            priority: SCHED_FIFO priority, 1 to 99.
+            priority: SCHED_FIFO priority of the node's thread, 1 to 99; with `rt=True`
+                derived from the rate when not given.
             core: CPU core to pin the node's thread to.
             watchdog: Watchdog timeout [s] of this node, instead of the scheduler's.
+                Not in this version.
             pubs: Topics it sends: a name, a list of names, `Pub(...)`, message
                 classes (the topic is named after the class), or `{topic: type}`.
             subs: Topics it receives: likewise, with `Sub(topic, capacity=...)`.

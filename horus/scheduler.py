@@ -55,16 +55,18 @@ class Scheduler:
         Args:
             tick_rate: Cycles per second [Hz]: what `horus.tick()` counts and
                 `tick_once()` advances by. Match it to the fastest node.
-            rt: Ask for SCHED_FIFO and locked memory.
+            rt: Ask for SCHED_FIFO, locked memory and no garbage collection in ticks;
+                `degradations()` tells what was refused.
             deterministic: Run in virtual time on one thread, reproducibly.
-            blackbox_mb: Size of the flight recorder [MB]; 0 for none.
+            blackbox_mb: Size of the flight recorder [MB]; 0 for none. Not in this version.
             watchdog_ms: Timeout after which a tick counts as frozen [ms]; 0 for never.
-            recording: Record the session.
+                Not in this version.
+            recording: Record the session. Not in this version.
             name: For logs and reports; `"horus"` when not given.
             cores: CPU cores to run on.
             max_deadline_misses: Stop after this many misses in all; None for no limit.
             verbose: Log at debug level and print the timing report after `run()`.
-            telemetry: Endpoint URL for metrics.
+            telemetry: Endpoint URL for metrics. Not in this version.
             loop: The event loop of `run()`: `"uvloop"` or `"asyncio"`.
             shutdown_timeout: How long each node's shutdown may take [s].
             seed: Seed of `horus.rng_float()` in deterministic mode.
