@@ -148,10 +148,6 @@ class Timeline:
         """Return wall time [s]: fixed at construction plus monotonic progress."""
         return (self.now_ns() + self._wall_offset_ns) / NS_PER_S
 
-    def wall_ns_at(self, instant_ns: int) -> int:
-        """Return the wall time of an instant of this timeline [ns since 1970]."""
-        return instant_ns + self._wall_offset_ns
-
     def elapsed_s(self) -> float:
         """Return the time since the scheduler first started [s]."""
         return 0.0 if self.started_ns is None else to_s(self.now_ns() - self.started_ns)

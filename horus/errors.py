@@ -62,6 +62,7 @@ class NodeError(HorusError):
     def __init__(self, node: str, phase: str, cause: BaseException) -> None:
         """Name the node, the callback and what it raised."""
         super().__init__(f"node {node!r}: {phase}() raised {type(cause).__name__}: {cause}")
+        self.__cause__ = cause
         self.node = node
         self.phase = phase
 

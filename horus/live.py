@@ -235,9 +235,7 @@ class LiveNode:
         not look healthy.
         """
         self.leave_service()
-        failure = NodeError(self.name, "tick", exc)
-        failure.__cause__ = exc
-        self.control.fail(failure)
+        self.control.fail(NodeError(self.name, "tick", exc))
 
     def renew(self) -> None:
         """Get ready for another `init()`: a new run begins."""

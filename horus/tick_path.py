@@ -172,15 +172,9 @@ def _act(
     if action.skip_next:
         live.skip_next = live.gated = True
     if action.fatal and error is not None:
-        live.control.fail(_as_node_error(live, error))
+        live.control.fail(NodeError(live.name, "tick", error))
     if action.restart:
         live.plan_restart()
-
-
-def _as_node_error(live: LiveNode, error: BaseException) -> NodeError:
-    failure = NodeError(live.name, "tick", error)
-    failure.__cause__ = error
-    return failure
 
 
 def _admitted(live: LiveNode) -> bool:

@@ -62,6 +62,7 @@ class Simulation(Stepper):
             return
         self._begun = True
         self.timeline.begin(self._clock.now_ns())
+        self._find_order()
         for live in self._in_order:
             self._join(live)
         for edge in contradictions(self._in_order):
@@ -98,6 +99,7 @@ class Simulation(Stepper):
     def _add(self, live: LiveNode) -> None:
         super()._add(live)
         if self._begun and live in self._in_order:
+            self._find_order()
             self._join(live)
 
     def _remove(self, live: LiveNode) -> None:
@@ -112,7 +114,6 @@ class Simulation(Stepper):
         super()._remove(live)
 
     def _join(self, live: LiveNode) -> None:
-        self._find_order()
         trigger = live.trigger
         if trigger is None:
             self._releases.add(live, self._places[live], self._clock.now_ns())
