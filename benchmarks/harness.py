@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import datetime
 import json
 import math
@@ -40,6 +41,13 @@ class Contender:
     python: Path
     import_root: Path | None = None
     """Directory put on the import path; None when the package is installed for ``python``."""
+    script: Path = WORKLOADS
+    """What runs the workloads: called as ``script NAME [arguments] --out FILE``."""
+    arguments: tuple[str, ...] = ()
+    timeout_s: float = 180.0
+    """How long one workload may take [s]."""
+    workloads: tuple[str, ...] | None = None
+    """The workloads it takes part in; None for all."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,12 +129,18 @@ def percentile(samples: Sequence[float], percent: float) -> float:
 
 
 def run_child(
-    contender: Contender, workload: str, *, round_number: int, quick: bool, timeout_s: float = 180.0
+    contender: Contender,
+    workload: str,
+    *,
+    round_number: int,
+    quick: bool,
+    timeout_s: float | None = None,
 ) -> ChildRun:
     """Run one workload in the contender's interpreter and return its samples or its error."""
     before = cpu_times()
     try:
-        result = _spawn(contender, workload, quick=quick, timeout_s=timeout_s)
+        limit_s = contender.timeout_s if timeout_s is None else timeout_s
+        result = _spawn(contender, workload, quick=quick, timeout_s=limit_s)
     except ChildError as error:
         return ChildRun(
             round=round_number, workload=workload, contender=contender.label, error=str(error)
@@ -187,7 +201,8 @@ def _spawn(contender: Contender, workload: str, *, quick: bool, timeout_s: float
         out = Path(scratch, "samples.json")
         # -P keeps the script's directory off the import path: the checkout beside it must not be
         # what a contender installed elsewhere imports.
-        command = [str(contender.python), "-P", str(WORKLOADS), workload, "--out", str(out)]
+        command = [str(contender.python), "-P", str(contender.script), workload]
+        command += [*contender.arguments, "--out", str(out)]
         if quick:
             command.append("--quick")
         namespace = f"bench{os.getpid()}"
@@ -248,6 +263,8 @@ def run_rounds(
     for number in range(1, rounds + 1):
         for workload in workloads:
             for contender in contenders:
+                if contender.workloads is not None and workload not in contender.workloads:
+                    continue
                 progress(f"round {number}/{rounds}  {workload}  {contender.label}")
                 run = run_child(contender, workload, round_number=number, quick=quick)
                 for _ in range(CALM_ATTEMPTS - 1):
@@ -338,6 +355,50 @@ def processor_name() -> str:
         return platform.machine()
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.machine()
+
+
+def describe(runs: Sequence[ChildRun], facts: Mapping[str, str]) -> list[str]:
+    """Return the lines above a result: the machine, what was measured, and who disturbed it."""
+    lines = [f"{name}: {value}" for name, value in facts.items()]
+    packages = {run.contender: run.package for run in runs if run.package}
+    for label, package in packages.items():
+        python = f" on Python {package['python']}" if "python" in package else ""
+        lines.append(f"{label}: version {package['version']}{python}")
+    loads = [run.other_load_percent for run in runs if run.other_load_percent is not None]
+    if loads:
+        lines.append(
+            f"other processes meanwhile: {statistics.median(loads):.0f} % of all CPUs in the "
+            f"median run, {max(loads):.0f} % in the worst"
+        )
+    return lines
+
+
+def failures(runs: Sequence[ChildRun]) -> list[str]:
+    """Return one line per failed run."""
+    return [
+        f"round {run.round}, {run.workload} of {run.contender} failed: {run.error}"
+        for run in runs
+        if run.error is not None
+    ]
+
+
+def at_least_one(text: str) -> int:
+    """Parse an option that counts something."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, not {value}")
+    return value
+
+
+def output_file(text: str) -> Path:
+    """Parse the name of a file to write.
+
+    A directory that does not exist is found out now rather than after minutes of measuring.
+    """
+    path = Path(text)
+    if not path.absolute().parent.is_dir():
+        raise argparse.ArgumentTypeError(f"no directory {path.absolute().parent}")
+    return path
 
 
 def machine_facts() -> dict[str, str]:

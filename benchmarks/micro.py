@@ -180,10 +180,12 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         action="store_true",
         help=f"measure {peers.HORUS_ROBOTICS.requirement} too, in an environment made in .bench/",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all raw samples")
+    parser.add_argument(
+        "--json", type=harness.output_file, metavar="FILE", help="write all raw samples"
+    )
     parser.add_argument("--quick", action="store_true", help="one short round: smoke, not figures")
     parser.add_argument(
-        "--rounds", type=_at_least_one, metavar="N", help="default 5; 1 with --quick"
+        "--rounds", type=harness.at_least_one, metavar="N", help="default 5; 1 with --quick"
     )
     parser.add_argument(
         "--calm",
@@ -202,19 +204,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help=f"run only these: {', '.join(WORKLOADS)}",
     )
     options = parser.parse_args(argv)
-    if options.json is not None and not options.json.absolute().parent.is_dir():
-        # Found out now rather than after minutes of measuring.
-        parser.error(f"--json: no directory {options.json.absolute().parent}")
     if options.rounds is None:
         options.rounds = 1 if options.quick else 5
     return options
-
-
-def _at_least_one(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, not {value}")
-    return value
 
 
 def report(
@@ -229,26 +221,14 @@ def report(
     measures = [measure for measure in MEASURES if measure.workload in only]
     rows = harness.table_rows(runs, measures, contenders)
     table = harness.render_markdown(rows) if markdown else harness.render_text(rows)
-    versions = {run.contender: run.package for run in runs if run.package}
-    lines = [f"{name}: {value}" for name, value in facts.items()]
-    lines += [
-        f"{label}: version {package['version']} on Python {package['python']}"
-        for label, package in versions.items()
-    ]
-    loads = [run.other_load_percent for run in runs if run.other_load_percent is not None]
-    if loads:
-        lines.append(
-            f"other processes meanwhile: {statistics.median(loads):.0f} % of all CPUs in the "
-            f"median run, {max(loads):.0f} % in the worst"
-        )
+    lines = harness.describe(runs, facts)
     rounds = max((run.round for run in runs), default=0)
     notes = f"Figures are medians over {rounds} round{'s' if rounds != 1 else ''}"
     notes += " (lowest-highest round)." if rounds > 1 else "."
     if len(contenders) > 1:
         notes += " ratio = this package / peer."
     notes += ' Lower is better, except for "ticks run".'
-    for run in (run for run in runs if run.error is not None):
-        notes += f"\nround {run.round}, {run.workload} of {run.contender} failed: {run.error}"
+    notes = "\n".join([notes, *harness.failures(runs)])
     head = "  \n".join(lines) if markdown else "\n".join(lines)
     return f"{head}\n\n{table}\n\n{notes}"
 
@@ -267,7 +247,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except peers.PeerError as error:
             print(error, file=sys.stderr)
             return 2
-        contenders.append(Contender(label=f"{peer.distribution} {peer.version}", python=python))
+        contenders.append(Contender(label=peer.label, python=python))
     runs = harness.run_rounds(
         contenders,
         options.only,

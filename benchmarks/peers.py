@@ -28,11 +28,18 @@ class Peer:
 
     distribution: str
     version: str
+    companions: tuple[str, ...] = ()
+    """Further requirements, pinned, that the package does not pull in itself."""
 
     @property
     def requirement(self) -> str:
         """Return the pinned requirement as pip takes it."""
         return f"{self.distribution}=={self.version}"
+
+    @property
+    def label(self) -> str:
+        """Return the name in tables."""
+        return f"{self.distribution} {self.version}"
 
     def interpreter(self, cache: Path = CACHE) -> Path:
         """Return the interpreter of this peer's virtual environment, making it on first use.
@@ -57,8 +64,9 @@ class Peer:
             venv.create(home, with_pip=True)
         except (OSError, subprocess.CalledProcessError) as error:
             raise PeerError(f"cannot make a virtual environment in {home}: {error}") from error
+        pip = [python, "-m", "pip", "install", "--disable-pip-version-check"]
         install = subprocess.run(
-            [python, "-m", "pip", "install", "--disable-pip-version-check", self.requirement],
+            [*pip, self.requirement, *self.companions],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -72,3 +80,4 @@ class Peer:
 
 
 HORUS_ROBOTICS = Peer(distribution="horus-robotics", version="0.4.1")
+DORA = Peer(distribution="dora-rs", version="1.1.0", companions=("dora-rs-cli==1.1.0",))

@@ -374,7 +374,7 @@ class LiveNode:
         if summary is not None:
             self.emit(
                 logging.WARNING,
-                f"runs before {predecessor.name}, which is not done by its deadline "
+                f"runs before {predecessor.name}, which is late, to keep its own deadline "
                 f"({summary.held_back + 1} times since the last message)",
             )
 

@@ -3,7 +3,7 @@
 Everything here concerns the calling thread or the whole process, raises OSError
 where the kernel refuses, and does nothing on its own account.
 
-Source: timerfd_create(2), sched(7), sched_setaffinity(2), mlockall(2),
+Source: timerfd_create(2), sched(7), sched_setaffinity(2), setpriority(2), mlockall(2),
 PR_SET_TIMERSLACK in prctl(2), /sys/devices/system/cpu/isolated.
 """
 
@@ -88,6 +88,32 @@ def run_fifo(priority: int) -> None:
     if not hasattr(os, "sched_setscheduler"):
         raise OSError("SCHED_FIFO is not available on this platform")
     os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+
+
+def run_first() -> None:
+    """Let the calling thread run before all others of ordinary scheduling: nice -20.
+
+    Threads and processes that it starts do not inherit it.
+
+    Raises:
+        OSError: Not permitted (no CAP_SYS_NICE), or not on this platform.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        raise OSError("per-thread priorities are not available on this platform")
+    # On Linux 0 is the calling thread, not the process: getpriority(2), C library differences.
+    os.setpriority(os.PRIO_PROCESS, 0, -20)
+    os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+
+
+def niceness() -> int:
+    """Return the nice value of the calling thread, -20 to 19; lower runs first."""
+    return os.getpriority(os.PRIO_PROCESS, 0) if hasattr(os, "getpriority") else 0
+
+
+def run_ordinarily(niceness: int) -> None:
+    """Undo `run_first`: ordinary scheduling with this nice value for the calling thread."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    os.setpriority(os.PRIO_PROCESS, 0, niceness)
 
 
 def affinity() -> set[int]:

@@ -48,6 +48,7 @@ class Scheduler:
         telemetry: str | None = None,
         loop: str = "uvloop",
         shutdown_timeout: float = 3.0,
+        spin_us: float | None = None,
         seed: int = 0,
     ) -> None:
         """Configure a scheduler; nothing runs yet.
@@ -69,6 +70,10 @@ class Scheduler:
             telemetry: Endpoint URL for metrics. Not in this version.
             loop: The event loop of `run()`: `"uvloop"` or `"asyncio"`.
             shutdown_timeout: How long each node's shutdown may take [s].
+            spin_us: How much early an Rt thread may wake up, to have the interpreter at
+                its release [us]. It wakes early by the delay of its latest wake-ups,
+                at most this much and a quarter of its period. 0 for never; None for
+                200 with `rt=True`, else 0.
             seed: Seed of `horus.rng_float()` in deterministic mode.
 
         Raises:
@@ -88,6 +93,7 @@ class Scheduler:
             telemetry=telemetry,
             loop=loop,
             shutdown_timeout=shutdown_timeout,
+            spin_us=spin_us,
             seed=seed,
         )
         unavailable.warn_of_scheduler(self._spec)

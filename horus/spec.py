@@ -11,7 +11,7 @@ from enum import StrEnum
 
 from horus.errors import ConfigError, ConfigWarning, warn_user
 from horus.timing import period_ns
-from horus.units import NS_PER_MS, NS_PER_S, readable
+from horus.units import NS_PER_MS, NS_PER_S, NS_PER_US, readable
 from horus.validation import (
     check_compute,
     check_core,
@@ -24,6 +24,7 @@ from horus.validation import (
     check_rate,
     check_topic,
     is_int,
+    is_number,
     member,
     optional_duration,
 )
@@ -31,6 +32,7 @@ from horus.validation import (
 DEFAULT_RATE_HZ = 30.0
 AUTO_BUDGET = 0.80
 AUTO_DEADLINE = 0.95
+DEFAULT_SPIN_US, LONGEST_SPIN_US = 200, 1000
 _SUSPICIOUS_LIMIT_NS = 60 * NS_PER_S
 
 
@@ -271,6 +273,7 @@ class SchedulerSpec:
     telemetry: str | None
     loop: str
     shutdown_timeout_ns: int
+    spin_ns: int
     seed: int
 
 
@@ -289,6 +292,7 @@ def make_scheduler_spec(
     telemetry: object,
     loop: object,
     shutdown_timeout: object,
+    spin_us: object,
     seed: object,
 ) -> SchedulerSpec:
     """Validate a scheduler's arguments.
@@ -316,5 +320,16 @@ def make_scheduler_spec(
         telemetry=telemetry,
         loop=loop,
         shutdown_timeout_ns=check_duration("shutdown_timeout", shutdown_timeout),
+        spin_ns=_spin_ns(spin_us, rt),
         seed=check_count("seed", seed),
     )
+
+
+def _spin_ns(spin_us: object, rt: object) -> int:
+    if spin_us is None:
+        return DEFAULT_SPIN_US * NS_PER_US if rt else 0
+    if not is_number(spin_us) or not 0 <= spin_us <= LONGEST_SPIN_US:
+        raise ConfigError(
+            "spin_us", spin_us, f"must be a number of microseconds from 0 to {LONGEST_SPIN_US}"
+        )
+    return round(spin_us * NS_PER_US)

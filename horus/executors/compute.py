@@ -11,15 +11,16 @@ import functools
 from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
 from horus.loop.cycle import Cycle
+from horus.loop.realtime import RealTime
 from horus.tick_path import build_tick
 
 
 class ComputeThread(NodeThread):
     """Runs a tick when told to."""
 
-    def __init__(self, live: LiveNode) -> None:
+    def __init__(self, live: LiveNode, real_time: RealTime) -> None:
         """Prepare an idle worker."""
-        super().__init__(live)
+        super().__init__(live, functools.partial(real_time.enter_worker_thread, live))
         self.busy = False
         self._run_tick = build_tick(live)
 
@@ -34,14 +35,15 @@ class ComputeThread(NodeThread):
 class ComputeExecutor(ThreadExecutor[ComputeThread]):
     """Hands each release to the node's worker; one that finds it busy is skipped."""
 
-    def __init__(self, cycle: Cycle) -> None:
+    def __init__(self, cycle: Cycle, real_time: RealTime) -> None:
         """Serve the nodes of one run."""
         super().__init__()
         self._cycle = cycle
+        self._real_time = real_time
 
     def make_thread(self, live: LiveNode) -> ComputeThread:
         """Return the node's thread, not started."""
-        return ComputeThread(live)
+        return ComputeThread(live, self._real_time)
 
     def engage(self, live: LiveNode, from_ns: int) -> None:
         """Release the node on its grid."""

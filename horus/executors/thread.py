@@ -36,6 +36,7 @@ class NodeThread(threading.Thread):
         self._enter = enter
         self._jobs: deque[Callable[[], None]] = deque()
         self._closing = False
+        self._broken = False
         # A lock as a binary semaphore. Waiting for it with a timeout sleeps as
         # exactly as clock_nanosleep (sem_clockwait on CLOCK_MONOTONIC), and,
         # unlike a sleep, ends when there is something to do.
@@ -65,9 +66,9 @@ class NodeThread(threading.Thread):
         except RuntimeError:
             pass  # woken already
 
-    def park(self, timeout_ns: int | None = None) -> None:
-        """Sleep until woken, for at most `timeout_ns` [ns]."""
-        self._parked.acquire(True, -1 if timeout_ns is None else to_s(timeout_ns))
+    def park(self, timeout_ns: int | None = None) -> bool:
+        """Sleep until woken, for at most `timeout_ns` [ns]; return whether woken."""
+        return self._parked.acquire(True, -1 if timeout_ns is None else to_s(timeout_ns))
 
     def run(self) -> None:
         """Serve until closed, whatever happens: `shutdown()` is to run here, too."""
@@ -76,11 +77,13 @@ class NodeThread(threading.Thread):
             try:
                 if self._jobs:
                     self._jobs.popleft()()
+                elif self._broken:
+                    self.park()
                 else:
                     self.idle()
             except BaseException as exc:
                 self.live.broken(exc)
-                self.idle = self.park  # type: ignore[method-assign]
+                self._broken = True
 
     def idle(self) -> None:
         """Do what is to be done when there is no job."""

@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator
 
-_SWITCH_INTERVAL_S = 100e-6
+_SWITCH_INTERVAL_S = 50e-6
 """Longest time a thread computes on while another one waits for its turn [s].
 
 At CPython's default of 5 ms a single busy planner makes each Rt thread

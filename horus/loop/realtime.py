@@ -39,6 +39,7 @@ class RealTime:
         """Find out what would be granted, without changing anything that lasts."""
         self._rt = spec.rt
         self._cores = spec.cores
+        self.spin_ns = spec.spin_ns
         self._degradations: dict[str, None] = {}
         self._lock = threading.Lock()
         if spec.rt:
@@ -81,7 +82,7 @@ class RealTime:
 
     def enter_node_thread(self, live: LiveNode) -> None:
         """Give a node's thread its core, its priority and exact sleeps; it ends with the run."""
-        cores = self._cores if live.spec.core is None else (live.spec.core,)
+        cores = self._cores_of(live)
         if cores is not None:
             self._pin(cores, f"node {live.name!r}")
         priority = self.priority_of(live)
@@ -96,6 +97,19 @@ class RealTime:
                     self.degrade(f"node {live.name!r}: priority {priority} refused ({reason})")
         with contextlib.suppress(OSError):
             os_rt.set_timer_slack(_TIMER_SLACK_NS)
+
+    def enter_worker_thread(self, live: LiveNode) -> None:
+        """Give a compute node's thread its cores; under `rt=True`, see that it is not preempted.
+
+        A thread that holds the interpreter while the kernel runs another program
+        in its place keeps every Rt thread waiting, whatever their priorities.
+        """
+        cores = self._cores if live.spec.core is None else (live.spec.core,)
+        if cores is not None:
+            self._pin(cores, f"node {live.name!r}")
+        if self._rt:
+            with contextlib.suppress(OSError):
+                os_rt.run_first()
 
     def enter_supervisor_thread(self) -> None:
         """Put supervision above every node."""
@@ -114,6 +128,11 @@ class RealTime:
             with contextlib.suppress(OSError):
                 undo.callback(os_rt.set_timer_slack, os_rt.timer_slack_ns())
                 os_rt.set_timer_slack(_TIMER_SLACK_NS)
+            if self._rt:
+                with contextlib.suppress(OSError):
+                    before = os_rt.niceness()
+                    os_rt.run_first()
+                    undo.callback(os_rt.run_ordinarily, before)
             yield
 
     @contextlib.contextmanager
@@ -124,6 +143,23 @@ class RealTime:
                 undo.enter_context(_memory_locked(self))
                 undo.enter_context(_garbage_frozen())
             yield
+
+    def _cores_of(self, live: LiveNode) -> tuple[int, ...] | None:
+        """Return where a node's real-time thread runs; None for anywhere.
+
+        Under `rt=True` nodes that name no core share one: an isolated one if there
+        is any, else the last of those allowed. Passing the baton within a core
+        takes half as long as across two, and a thread that stays is not migrated.
+        """
+        if live.spec.core is not None:
+            return (live.spec.core,)
+        allowed = os_rt.affinity() if self._cores is None else set(self._cores)
+        if self._rt and len(allowed) > 1:
+            isolated = os_rt.isolated_cores()
+            # Isolated cores are in nobody's default affinity: they have to be asked for.
+            usable = isolated if self._cores is None else isolated & allowed
+            return (max(usable or allowed),)
+        return self._cores
 
     def _pin(self, cores: tuple[int, ...], who: str) -> None:
         try:
