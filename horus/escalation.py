@@ -1,15 +1,16 @@
-"""What to do about a tick that failed, overran or came late: a pure decision.
+"""What to do about a tick that failed, overran, came late or does not end: pure decisions.
 
-`decide` looks at an outcome and the node's policies and returns an `Action`.
-It reads no clock, takes no lock and calls nobody, so that every row of the
-policy tables can be tested without running anything. The tick path acts.
+`decide` looks at an outcome and the node's policies and returns an `Action`;
+`grade` looks at how long a tick has lasted. Both read no clock, take no lock and
+call nobody, so that every row of the policy tables can be tested without running
+anything. The tick path and the supervisor act.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from horus.spec import FailurePolicy, Miss
+from horus.spec import FailurePolicy, Health, Miss
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,3 +69,13 @@ def decide(
         restart=outcome.failed and failure_policy is FailurePolicy.RESTART,
         fatal=outcome.failed and failure_policy is FailurePolicy.FATAL,
     )
+
+
+GRADES = (Health.HEALTHY, Health.WARNING, Health.UNHEALTHY, Health.ISOLATED)
+"""What a node is after no, one, two and three watchdog timeouts."""
+
+
+def grade(lasted_ns: int, timeout_ns: int) -> Health:
+    """Return the health of a node whose tick has lasted this long without an end [ns]."""
+    timeouts = max(0, lasted_ns - 1) // timeout_ns
+    return GRADES[min(timeouts, len(GRADES) - 1)]

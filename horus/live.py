@@ -14,11 +14,11 @@ from horus import clock
 from horus.clock import TickContext, Timeline
 from horus.core import core_of
 from horus.errors import NodeError
-from horus.ratelimit import Limiter
-from horus.spec import ExecutionClass, FailurePolicy, Health, NodeSpec, NodeState
-from horus.stats import NodeCounters, NodeTiming
+from horus.reports import NodeReports
+from horus.spec import ExecutionClass, Health, NodeSpec, NodeState
+from horus.stats import NodeCounters
 from horus.timing import ReleaseGrid
-from horus.units import NS_PER_MS, NS_PER_S, readable, to_s
+from horus.units import NS_PER_MS, NS_PER_S, readable
 
 if TYPE_CHECKING:
     from horus.topics import Subscription
@@ -95,13 +95,22 @@ class LiveNode:
         """Whether a thread or task that never returned may still hold this object."""
         self.skip_next = False
         self.in_episode = False
+        self.held = False
+        """Whether the node is kept from ticking until the safe state is cleared."""
+        self.alert = False
+        """Whether the end of the next tick deserves a closer look."""
+        self.critical_ns: int | None = None
+        """How long a tick of a critical node may take [ns]; None for other nodes."""
+        self.hook_returned = threading.Event()
+        """Whether no safe-state hook is owed or in progress since the node was held."""
+        self.hook_returned.set()
+        self.reviving = False
+        """Whether `init()` runs again in place of a tick, before it restarts."""
+        self.reports = NodeReports(core.log, self.tick_context)
         self.callbacks = core.callbacks
         self._claims = threading.Lock()
         self._restart_at_ns = 0
         self._backoff_ns = FIRST_BACKOFF_NS
-        self._error_log = Limiter()
-        self._limit_log = Limiter()
-        self._order_log = Limiter()
         self.apply(core.spec)
 
     # -- what it is --------------------------------------------------------------
@@ -216,8 +225,7 @@ class LiveNode:
 
     def emit(self, level: int, message: str, exc: BaseException | None = None) -> None:
         """Log on the node's behalf."""
-        extra = {"node": self.name, "cycle": self.tick_context.cycle()}
-        self.core.log.log(level, "%s: %s", self.name, message, exc_info=exc, extra=extra)
+        self.reports.emit(level, message, exc)
 
     # -- life cycle --------------------------------------------------------------
 
@@ -241,7 +249,9 @@ class LiveNode:
         """Get ready for another `init()`: a new run begins."""
         if not self.initialized:
             self.state = NodeState.UNINITIALIZED
-            self.skip_next = self.in_episode = False
+            self.skip_next = self.in_episode = self.held = self.alert = False
+            self.hook_returned.set()
+            self.health = Health.HEALTHY
             self.tick_context.start_ns = self.tick_context.previous_ns = clock.NEVER
 
     def claim_shutdown(self) -> bool:
@@ -262,6 +272,7 @@ class LiveNode:
         """
         fresh = LiveNode(self.node, self.timeline, self.control, self.sequence)
         fresh.trigger = self.trigger
+        fresh.critical_ns = self.critical_ns
         fresh.apply(self.spec)
         self.control = _Nobody()
         return fresh
@@ -276,7 +287,14 @@ class LiveNode:
 
     def regate(self) -> None:
         """Close or open the gate as the state demands."""
-        self.gated = self.retired or self.skip_next or self.state is not NodeState.RUNNING
+        self.gated = self._must_be_admitted()
+        # Another thread may have closed the gate between the look and the step.
+        if not self.gated and self._must_be_admitted():
+            self.gated = True
+
+    def _must_be_admitted(self) -> bool:
+        closed = self.retired or self.held or self.skip_next
+        return closed or self.state is not NodeState.RUNNING
 
     def enter_service(self) -> None:
         """Tick when released, from now on."""
@@ -291,6 +309,8 @@ class LiveNode:
         """Decide whether a release of a gated node may tick."""
         if self.retired:
             return Admission.END
+        if self.held:
+            return Admission.SKIP
         if self.state is NodeState.RESTARTING:
             waited = self.timeline.now_ns() >= self._restart_at_ns
             return Admission.RESTART if waited else Admission.SKIP
@@ -334,74 +354,107 @@ class LiveNode:
     # -- trouble -----------------------------------------------------------------
 
     def tick_failed(self, exc: BaseException) -> None:
-        """Count, log (rate limited) and report an exception from `tick`."""
+        """Count, log and report an exception from `tick`."""
         self.counters.errors += 1
-        summary = self._error_log.note(self.timeline.now_ns(), 0)
-        if summary is not None:
-            policy = self.spec.failure_policy
-            quiet = policy is FailurePolicy.SKIP
-            others = summary.held_back
-            more = f" ({others} more since the last message)" if others else ""
-            self.emit(
-                logging.WARNING if quiet else logging.ERROR,
-                f"tick() raised {type(exc).__name__}: {exc}{more}",
-                exc if policy is None else None,
-            )
+        self.reports.tick_failed(exc, self.spec.failure_policy)
         self.notify_error(exc)
 
-    def limit_exceeded(self, limits: Limits, over_budget_ns: int, past_deadline_ns: int) -> str:
-        """Log an exceeded limit (rate limited); return its description."""
-        if past_deadline_ns > 0:
-            over_ns, kind, limit_ns = past_deadline_ns, "deadline", limits.deadline_ns
-        else:
-            over_ns, kind, limit_ns = over_budget_ns, "budget", limits.budget_ns
-        text = f"exceeded its {kind} of {readable(limit_ns)} by {readable(over_ns)}"
-        summary = self._limit_log.note(self.timeline.now_ns(), over_ns)
-        if summary is not None and summary.held_back:
-            self.emit(
-                logging.WARNING,
-                f"{summary.held_back + 1} ticks exceeded their limits in the last "
-                f"{readable(summary.period_ns)}, worst {readable(summary.worst)} over",
-            )
-        elif summary is not None:
-            self.emit(logging.WARNING, text)
-        return text
-
     def order_violated(self, predecessor: LiveNode) -> None:
-        """Count and log (rate limited) that this node ran before one it should follow."""
+        """Count and log that this node ran before one it should follow."""
         self.counters.order_violations += 1
-        summary = self._order_log.note(self.timeline.now_ns(), 0)
-        if summary is not None:
-            self.emit(
-                logging.WARNING,
-                f"runs before {predecessor.name}, which is late, to keep its own deadline "
-                f"({summary.held_back + 1} times since the last message)",
-            )
+        self.reports.order_violated(predecessor.name)
 
-    # -- reports -----------------------------------------------------------------
+    # -- supervision ---------------------------------------------------------------
 
-    def timing(self, now_ns: int) -> NodeTiming:
-        """Return the node's row of the timing report; `now_ns` is 0 when nothing runs."""
-        counters, times = self.counters, self.counters.times
-        event = self.spec.execution_class is ExecutionClass.EVENT
-        ticks = max(1, counters.ticks)
-        return NodeTiming(
-            name=self.name,
-            execution_class=self.spec.execution_class.value,
-            rate_hz=None if event else self.spec.rate_hz,
-            achieved_hz=counters.achieved_hz(0 if event else self.period_ns, now_ns),
-            ticks=counters.ticks,
-            execution_avg_s=to_s(times.execution_total_ns) / ticks,
-            execution_p99_s=times.execution_quantile_s(0.99),
-            execution_max_s=to_s(times.execution_max_ns),
-            start_latency_avg_s=to_s(times.latency_total_ns) / ticks,
-            start_latency_p99_s=times.latency_quantile_s(0.99),
-            start_latency_max_s=to_s(times.latency_max_ns),
-            budget_overruns=counters.budget_overruns,
-            deadline_misses=counters.deadline_misses,
-            skipped=counters.skipped,
-            errors=counters.errors,
-        )
+    @property
+    def reported_state(self) -> NodeState:
+        """The state as people see it: a node that is held says so."""
+        return NodeState.SAFE_STATE if self.held and self.initialized else self.state
+
+    @property
+    def has_hook(self) -> bool:
+        """Whether there is a safe-state hook."""
+        return self.callbacks["safe_state"] is not None
+
+    def frozen_for(self, limit_ns: int) -> bool:
+        """Return whether a tick has been running for longer than `limit_ns`.
+
+        Thread: any.
+        """
+        started_ns = self.tick_context.start_ns
+        return self.ticking and self.timeline.now_ns() - started_ns > limit_ns
+
+    def expire(self, health: Health) -> None:
+        """Take note that the watchdog has run out.
+
+        Thread: supervisor.
+        """
+        with self._claims:
+            self._expire(health)
+
+    def _expire(self, health: Health) -> None:
+        if self.health is Health.HEALTHY:
+            self.counters.watchdog_expirations += 1
+        self.health = health
+        self.alert = True
+
+    def recovered(self) -> bool:
+        """Return to health, because the tick has ended; return whether that is news.
+
+        An isolated node stays isolated.
+
+        Thread: the node's, or the supervisor.
+        """
+        with self._claims:
+            if self.health in (Health.HEALTHY, Health.ISOLATED):
+                return False
+            self.health = Health.HEALTHY
+        return True
+
+    def isolate(self, ticks: int) -> bool:
+        """Take the node out of the schedule, unless the tick in question has ended meanwhile.
+
+        Args:
+            ticks: The count of ticks when it was found frozen.
+
+        Thread: supervisor.
+        """
+        with self._claims:
+            if self.counters.ticks != ticks:
+                return False
+            self._expire(Health.ISOLATED)
+            if not self.held:
+                self._hold()
+        return True
+
+    def hold(self) -> bool:
+        """Let the node tick no more until `free`; return whether it did until now.
+
+        Thread: supervisor.
+        """
+        with self._claims:
+            if self.held:
+                return False
+            self._hold()
+        return True
+
+    def _hold(self) -> None:
+        # `held` first: whoever opens the gate looks at it afterwards.
+        self.held = True
+        self.gated = True
+        if self.has_hook:
+            self.hook_returned.clear()
+
+    def free(self) -> None:
+        """Let the node tick again, in good health.
+
+        Thread: any.
+        """
+        with self._claims:
+            self.held = False
+            self.health = Health.HEALTHY
+        self.in_episode = False
+        self.regate()
 
 
 class _Nobody:

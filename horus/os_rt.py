@@ -76,18 +76,19 @@ class TimerFd:
         os.close(self.fd)
 
 
-def run_fifo(priority: int) -> None:
+def run_fifo(priority: int, *, inherited: bool = False) -> None:
     """Schedule the calling thread with SCHED_FIFO at `priority`, 1 to 99.
 
-    Threads and processes that it starts get ordinary scheduling: a driver's helper
-    thread must not outrank the machine by inheritance.
+    Unless `inherited`, threads and processes that it starts get ordinary scheduling:
+    a driver's helper thread must not outrank the machine.
 
     Raises:
         OSError: Not permitted (no CAP_SYS_NICE), or not on this platform.
     """
     if not hasattr(os, "sched_setscheduler"):
         raise OSError("SCHED_FIFO is not available on this platform")
-    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    policy = os.SCHED_FIFO if inherited else os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+    os.sched_setscheduler(0, policy, os.sched_param(priority))
 
 
 def run_first() -> None:

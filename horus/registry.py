@@ -10,8 +10,10 @@ from horus.clock import Timeline
 from horus.errors import ConfigError, UnknownNodeError
 from horus.live import Control, LiveNode
 from horus.node import Node
-from horus.stats import TimingReport
+from horus.spec import ExecutionClass
+from horus.stats import NodeTiming, TimingReport
 from horus.topics import Bus
+from horus.units import to_s
 
 
 class Registry:
@@ -97,7 +99,7 @@ class Registry:
 
     def timing_report(self, now_ns: int) -> TimingReport:
         """Return a report on all nodes; `now_ns` is 0 when nothing runs."""
-        rows = tuple(live.timing(now_ns) for live in self.in_order)
+        rows = tuple(node_timing(live, now_ns) for live in self.in_order)
         return TimingReport(rows, virtual=self._timeline.deterministic)
 
     def safety_stats(self) -> dict[str, Any]:
@@ -116,9 +118,33 @@ class Registry:
         self.in_order = tuple(sorted(self._by_name.values(), key=lambda live: live.rank))
 
 
+def node_timing(live: LiveNode, now_ns: int) -> NodeTiming:
+    """Return a node's row of the timing report; `now_ns` is 0 when nothing runs."""
+    counters, times = live.counters, live.counters.times
+    event = live.spec.execution_class is ExecutionClass.EVENT
+    ticks = max(1, counters.ticks)
+    return NodeTiming(
+        name=live.name,
+        execution_class=live.spec.execution_class.value,
+        rate_hz=None if event else live.spec.rate_hz,
+        achieved_hz=counters.achieved_hz(0 if event else live.period_ns, now_ns),
+        ticks=counters.ticks,
+        execution_avg_s=to_s(times.execution_total_ns) / ticks,
+        execution_p99_s=times.execution_quantile_s(0.99),
+        execution_max_s=to_s(times.execution_max_ns),
+        start_latency_avg_s=to_s(times.latency_total_ns) / ticks,
+        start_latency_p99_s=times.latency_quantile_s(0.99),
+        start_latency_max_s=to_s(times.latency_max_ns),
+        budget_overruns=counters.budget_overruns,
+        deadline_misses=counters.deadline_misses,
+        skipped=counters.skipped,
+        errors=counters.errors,
+    )
+
+
 def node_stats(live: LiveNode, now_ns: int) -> dict[str, Any]:
     """Return a node's configuration, state and counters, as the contract shows them."""
-    counters, timing = live.counters, live.timing(now_ns)
+    counters, timing = live.counters, node_timing(live, now_ns)
     return {
         "name": live.name,
         "order": live.order,
@@ -126,7 +152,7 @@ def node_stats(live: LiveNode, now_ns: int) -> dict[str, Any]:
         "rate": timing.rate_hz,
         "achieved_rate": timing.achieved_hz,
         "priority": live.spec.priority,
-        "state": live.state.value,
+        "state": live.reported_state.value,
         "health": live.health.value,
         "total_ticks": counters.ticks,
         "errors_count": counters.errors,

@@ -61,7 +61,7 @@ class Scheduler:
             deterministic: Run in virtual time on one thread, reproducibly.
             blackbox_mb: Size of the flight recorder [MB]; 0 for none. Not in this version.
             watchdog_ms: Timeout after which a tick counts as frozen [ms]; 0 for never.
-                Not in this version.
+                See `add_critical_node` and `Node(watchdog=)`.
             recording: Record the session. Not in this version.
             name: For logs and reports; `"horus"` when not given.
             cores: CPU cores to run on.
@@ -121,7 +121,6 @@ class Scheduler:
         live = self._registry.add(node, self._session.control)
         core.owner = self
         core.request_stop = self._session.control.request_stop
-        unavailable.warn_of_node(core.spec)
         self._session.joined(live)
         return self
 
@@ -169,13 +168,29 @@ class Scheduler:
     def add_critical_node(self, name: str, timeout_ms: float) -> None:
         """Mark a node as safety-critical, with a watchdog timeout of its own [ms].
 
+        A tick of it that is due or running for longer puts the whole system in its safe
+        state: the safe-state hook of every node is called, in shutdown order, and nodes
+        that have one do not tick until `clear_safe_state()`.
+
         Raises:
             UnknownNodeError: There is no such node.
             ConfigError: The timeout is refused.
         """
-        self._registry.get(name)
-        check_duration("timeout_ms", timeout_ms, "milliseconds")
-        unavailable.warn(f"add_critical_node({name!r})", "no watchdog supervises the node")
+        live = self._registry.get(name)
+        live.critical_ns = check_duration("timeout_ms", timeout_ms, "milliseconds")
+        self._session.watch(live)
+
+    def clear_safe_state(self) -> list[str]:
+        """Let the nodes tick again that the safe state or their isolation has taken out.
+
+        Returns:
+            The names of nodes that cannot yet: an isolated one whose tick still does
+            not end, or one whose safe-state hook has not returned. Call it again later.
+
+        Raises:
+            StateError: A critical node is still frozen; nothing has changed.
+        """
+        return self._session.clear_safe_state()
 
     # -- running -------------------------------------------------------------------
 
@@ -391,8 +406,11 @@ class Scheduler:
         return self._registry.timing_report(self._session.reporting_ns())
 
     def safety_stats(self) -> dict[str, Any]:
-        """Return the sums of what went wrong, and each node's health."""
-        return self._registry.safety_stats()
+        """Return the sums of what went wrong, each node's health, and the safe state's reason."""
+        stats = self._registry.safety_stats()
+        stats["safe_state"] = self._session.safety.active
+        stats["safe_state_reason"] = self._session.safety.reason
+        return stats
 
     def capabilities(self) -> dict[str, Any]:
         """Return what real-time features this process may have, and facts about the machine.

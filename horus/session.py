@@ -5,20 +5,27 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from horus import clock, logs
 from horus.clock import MonotonicClock, SimClock, Timeline
 from horus.errors import NodeError, ShutdownTimeout, StateError
 from horus.executors import make_executors
 from horus.live import LiveNode
+from horus.loop.bridge import Bridge
 from horus.loop.control import RunControl
+from horus.loop.executor import Home
+from horus.loop.hooks import HookCaller, Report
 from horus.loop.private_loop import StepLoop
 from horus.loop.realtime import RealTime
 from horus.loop.runtime import Runtime, uninterrupted
+from horus.loop.safety import Safety
 from horus.loop.signals import stop_on_signals
 from horus.loop.simulation import Simulation
 from horus.loop.stepping import Stepper
+from horus.loop.supervision import Supervision
+from horus.loop.supervisor import Supervisor
+from horus.loop.watchdog import Watchdog
 from horus.registry import Registry
 from horus.spec import SchedulerSpec
 from horus.stream import MessageStream
@@ -56,6 +63,7 @@ class Session:
         self.registry = Registry(self.bus, self.timeline)
         self.control = RunControl(spec.max_deadline_misses)
         self.real_time = RealTime(spec)
+        self.safety = Safety(self._call_hooks)
         self.status = "idle"
         self._lock = threading.Lock()
         self._open = False
@@ -67,6 +75,8 @@ class Session:
         self._loop: StepLoop | None = None
         self._runtime: Runtime | None = None
         self._stepper: Stepper | None = None
+        self._supervisor: Supervisor | None = None
+        self._watched = spec.watchdog_ns > 0
         self._streams: set[MessageStream] = set()
 
     @property
@@ -128,6 +138,8 @@ class Session:
         """Run one cycle on the calling thread; the nodes stay initialised."""
         self._take_charge()
         self._stepping = True
+        if self._watched and not self._spec.deterministic:
+            self._supervise().start()
         try:
             self._open_stepper().cycle(only)
         finally:
@@ -168,11 +180,27 @@ class Session:
 
     def joined(self, live: LiveNode) -> None:
         """Let a node that was added take part: now, or from the next run or step on."""
+        self.watch(live)
         runtime, stepper = self._runtime, self._stepper
         if self.running and runtime is not None:
             runtime.add(live)
         elif self.running and stepper is not None:
             stepper.add(live)
+
+    def watch(self, live: LiveNode) -> None:
+        """Take note of a node's watchdog timeout, which is new or has changed."""
+        if live.spec.watchdog_ns or live.critical_ns:
+            self._watched = True
+            if self._supervisor is not None:
+                self._supervisor.poke()
+
+    def clear_safe_state(self) -> list[str]:
+        """Let the nodes tick again that are held; return the names of those that cannot yet.
+
+        Raises:
+            StateError: A critical node is still frozen.
+        """
+        return self.safety.clear(self.registry.in_order)
 
     def retimed(self, live: LiveNode) -> None:
         """Adopt a node's changed rate."""
@@ -245,6 +273,7 @@ class Session:
             self.status = "running"
         if not self._open:
             self._open = True
+            self.safety.reset()
             self.registry.renew()
 
     def _hand_back(self, *, keeps_open: bool) -> None:
@@ -266,10 +295,13 @@ class Session:
                 self._private_loop().run(self._runtime.close())
         finally:
             self._runtime = None
-            stepper = self._stepper or Stepper(self.timeline, self._private_loop, self._stopping)
+            stepper = self._stepper or self._make_stepper()
             self._stepper = None
             stepper.shut_down(self.registry.in_order)
             stepper.close()
+            if self._supervisor is not None:
+                self._supervisor.close()
+                self._supervisor = None
             if self._loop is not None:
                 self._loop.close()
                 self._loop = None
@@ -290,9 +322,10 @@ class Session:
     def _start_runtime(self) -> Runtime:
         if self._runtime is None:
             self._runtime = Runtime(
-                self._spec.name,
                 self.timeline,
                 self.real_time,
+                self._supervise(),
+                self.safety,
                 make_executors,
                 self._spec.shutdown_timeout_ns,
             )
@@ -302,12 +335,49 @@ class Session:
 
     def _open_stepper(self) -> Stepper:
         if self._stepper is None:
-            if self._sim_clock is None:
-                self._stepper = Stepper(self.timeline, self._private_loop, self._stopping)
-            else:
-                self._stepper = Simulation(self.timeline, self._sim_clock, self._stopping)
-        self._stepper.take_on(self.registry.in_order)
+            self._stepper = self._make_stepper()
+        if self._stepper.take_on(self.registry.in_order) and self._supervisor is not None:
+            self._supervisor.poke()
         return self._stepper
+
+    def _make_stepper(self) -> Stepper:
+        if self._sim_clock is None:
+            return Stepper(self.timeline, self._private_loop, self._stopping, self.safety)
+        supervision = self._make_supervision(lambda write: write())
+        return Simulation(self.timeline, self._sim_clock, self._stopping, self.safety, supervision)
+
+    def _make_supervision(self, report: Report) -> Supervision:
+        watchdog = Watchdog(self._spec.watchdog_ns, self._members)
+        return Supervision(watchdog, self.safety, self.timeline.now_ns, report)
+
+    def _members(self) -> Sequence[tuple[LiveNode, Home]]:
+        """Return the nodes that are run, each with its home. Thread: any."""
+        runtime, stepper = self._runtime, self._stepper
+        if runtime is not None and not self._stepping:
+            return runtime.members()
+        return () if stepper is None else stepper.members()
+
+    def _supervise(self) -> Supervisor:
+        """Return the supervisor of this session, which still has to be started."""
+        if self._supervisor is None:
+            real_time = self.real_time
+            supervisor = Supervisor(self._spec.name, real_time.enter_supervisor_thread)
+            supervision = self._make_supervision(supervisor.report)
+            supervisor.spawn(lambda: supervisor.watch(supervision, self.timeline.now_ns))
+            self._hooks = HookCaller(real_time.enter_hook_thread, self._bridge, supervisor.report)
+            self._supervisor = supervisor
+        return self._supervisor
+
+    def _bridge(self) -> Bridge | None:
+        runtime = self._runtime
+        return None if runtime is None else runtime.bridge
+
+    def _call_hooks(self, lives: Sequence[LiveNode]) -> None:
+        stepper = self._stepper
+        if isinstance(stepper, Simulation):
+            stepper.call_hooks(lives)
+        else:
+            self._hooks.start(lives)
 
     def _simulate(self, duration_ns: int | None, only: list[LiveNode] | None) -> None:
         """Run in virtual time on the calling thread."""

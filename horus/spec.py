@@ -86,6 +86,8 @@ class NodeState(StrEnum):
     """Initialised and ticking when released."""
     RESTARTING = "restarting"
     """A tick failed under `restart`; `init()` runs again after the back-off."""
+    SAFE_STATE = "safe_state"
+    """Held: it does not tick until `clear_safe_state()`."""
     ERROR = "error"
     """`init()` failed; the node is excluded from ticking."""
     STOPPING = "stopping"

@@ -105,7 +105,8 @@ class NodeCounters:
     """What one node has done since it was added.
 
     Thread: written by the node's tick path alone, except `skipped`, which
-    belongs to whoever releases the node.
+    belongs to whoever releases the node, and `watchdog_expirations`, which belongs
+    to the supervisor.
     """
 
     __slots__ = (

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import logging
 import threading
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -23,6 +24,7 @@ from typing import Any
 from horus.errors import NodeError
 from horus.escalation import Action, Outcome, decide
 from horus.live import Admission, Limits, LiveNode, being_cancelled, never_awaited
+from horus.spec import Health
 
 RunTick = Callable[[int], None]
 RunTickAsync = Callable[[int], Coroutine[Any, Any, None]]
@@ -122,7 +124,7 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException |
         add_times(execution_ns, start_ns - release_ns)
         over_budget_ns = execution_ns - limits[0]
         past_deadline_ns = finish_ns - release_ns - limits[1]
-        if over_budget_ns > 0 or past_deadline_ns > 0 or error is not None or live.in_episode:
+        if over_budget_ns > 0 or past_deadline_ns > 0 or error is not None or live.alert:
             enter_safe_state = _settle(live, limits, over_budget_ns, past_deadline_ns, error)
             context.ticking = False
             return enter_safe_state
@@ -150,7 +152,13 @@ def _settle(
         failure_policy=live.spec.failure_policy,
         in_episode=live.in_episode,
     )
-    live.in_episode = outcome.missed
+    live.in_episode = live.alert = outcome.missed
+    if live.health is not Health.HEALTHY and live.recovered():
+        live.reports.emit(logging.INFO, "healthy again")
+    if live.health is Health.ISOLATED:
+        live.reports.emit(
+            logging.WARNING, "its frozen tick has ended; clear_safe_state() lets it tick again"
+        )
     if error is not None:
         live.tick_failed(error)
     if outcome.over_budget_ns:
@@ -159,14 +167,19 @@ def _settle(
         counters.deadline_misses += 1
         live.control.count_miss()
     _act(live, limits, outcome, action, error)
-    return action.enter_safe_state
+    # Held: the supervisor has called the hook already.
+    return action.enter_safe_state and not live.held
 
 
 def _act(
     live: LiveNode, limits: Limits, outcome: Outcome, action: Action, error: BaseException | None
 ) -> None:
     if action.warn:
-        text = live.limit_exceeded(limits, outcome.over_budget_ns, outcome.past_deadline_ns)
+        if outcome.past_deadline_ns:
+            kind, limit_ns, over_ns = "deadline", limits.deadline_ns, outcome.past_deadline_ns
+        else:
+            kind, limit_ns, over_ns = "budget", limits.budget_ns, outcome.over_budget_ns
+        text = live.reports.limit_exceeded(kind, limit_ns, over_ns)
         if action.stop:
             live.control.request_stop(f"node {live.name!r} {text}")
     if action.skip_next:
@@ -180,7 +193,9 @@ def _act(
 def _admitted(live: LiveNode) -> bool:
     admission = live.admit()
     if admission is Admission.RESTART:
+        live.reviving = True
         live.restarted(live.run_phase("init"))
+        live.reviving = False
         admission = live.admit()
     return _counted(live, admission)
 
@@ -188,7 +203,9 @@ def _admitted(live: LiveNode) -> bool:
 async def _admitted_async(live: LiveNode) -> bool:
     admission = live.admit()
     if admission is Admission.RESTART:
+        live.reviving = True
         live.restarted(await live.run_phase_async("init"))
+        live.reviving = False
         admission = live.admit()
     return _counted(live, admission)
 

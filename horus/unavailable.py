@@ -5,25 +5,18 @@ from __future__ import annotations
 from typing import NoReturn
 
 from horus.errors import StateError, UnavailableWarning, warn_user
-from horus.spec import NodeSpec, SchedulerSpec
+from horus.spec import SchedulerSpec
 
 
 def warn_of_scheduler(spec: SchedulerSpec) -> None:
     """Warn of the arguments of a scheduler that have no effect."""
     for asked, argument, consequence in (
-        (spec.watchdog_ns, "watchdog_ms=", "frozen nodes are not detected"),
         (spec.blackbox_mb, "blackbox_mb=", "there is no flight recorder"),
         (spec.recording, "recording=True", "nothing is recorded"),
         (spec.telemetry, "telemetry=", "no metrics are sent"),
     ):
         if asked:
             warn(argument, consequence)
-
-
-def warn_of_node(spec: NodeSpec) -> None:
-    """Warn of the arguments of a node that have no effect."""
-    if spec.watchdog_ns:
-        warn(f"watchdog= of node {spec.name!r}", "a frozen tick is not detected")
 
 
 def warn(feature: str, consequence: str) -> None:

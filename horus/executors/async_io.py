@@ -5,19 +5,27 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Coroutine
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, NamedTuple
 
 from horus.executors.base import LoopExecutor
 from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
+from horus.loop.stacks import Stack, stack_of_task, stack_of_thread
 from horus.tick_path import RunTickAsync, build_async_tick
+
+
+class _Tick(NamedTuple):
+    """An async tick that was started."""
+
+    task: asyncio.Task[None]
+    release_ns: int
 
 
 class TaskRunner:
     """Runs async callbacks, one at a time per node, each in a task of the node's context.
 
-    Thread: loop, except `call`.
+    Thread: loop, except the methods that say otherwise.
     """
 
     def __init__(self, bridge: Bridge) -> None:
@@ -25,7 +33,7 @@ class TaskRunner:
         self._bridge = bridge
         self._loop = bridge.loop
         self._run_ticks: dict[LiveNode, RunTickAsync] = {}
-        self._ticks: dict[LiveNode, asyncio.Task[None]] = {}
+        self._ticks: dict[LiveNode, _Tick] = {}
         self._latest: dict[LiveNode, asyncio.Task[None]] = {}
 
     def adopt(self, live: LiveNode) -> None:
@@ -42,7 +50,8 @@ class TaskRunner:
 
     def start(self, live: LiveNode, release_ns: int) -> asyncio.Task[None]:
         """Start a tick; the caller has made sure that the node is not busy."""
-        task = self._ticks[live] = self._spawn(live, self._run_ticks[live](release_ns))
+        task = self._spawn(live, self._run_ticks[live](release_ns))
+        self._ticks[live] = _Tick(task, release_ns)
         task.add_done_callback(lambda _: self._ticks.pop(live, None))
         return task
 
@@ -51,9 +60,28 @@ class TaskRunner:
 
         A safe-state hook that the tick has led to is not cut short.
         """
-        task = self._ticks.get(live)
-        if task is not None and live.ticking and task is not _current_task():
-            task.cancel()
+        tick = self._ticks.get(live)
+        if tick is not None and live.ticking and tick.task is not _current_task():
+            tick.task.cancel()
+
+    def due_ns(self, live: LiveNode) -> int | None:
+        """Return the release of a tick that was started and waits for the loop [ns].
+
+        Thread: any.
+        """
+        tick = self._ticks.get(live)
+        return None if tick is None else tick.release_ns
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where the tick in progress waits; without one, where the loop is.
+
+        Thread: any.
+        """
+        tick = self._ticks.get(live)
+        thread_id = self._bridge.thread_id
+        if tick is None or not live.ticking:
+            return stack_of_thread(thread_id)
+        return stack_of_task(tick.task, thread_id)
 
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
         """Run a callback once those before it have ended.
@@ -115,6 +143,19 @@ class AsyncIoExecutor(LoopExecutor):
     def cancel(self, live: LiveNode) -> None:
         """Cancel the tick in progress."""
         self._tasks.cancel(live)
+
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return the release that waits for the loop."""
+        started_ns = self._tasks.due_ns(live)
+        return super().due_ns(live, now_ns) if started_ns is None else started_ns
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where the node's task waits."""
+        return self._tasks.stack(live)
+
+    def isolate(self, live: LiveNode) -> None:
+        """Cancel the tick in progress, as soon as the loop is free."""
+        self._bridge.post(lambda: self._tasks.cancel(live))
 
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
         """Run a callback in a task."""

@@ -7,6 +7,7 @@ from concurrent.futures import Future
 from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
+from horus.loop.stacks import Stack, stack_of_thread
 
 
 def run_into(future: Future[bool], live: LiveNode, phase: str | None) -> None:
@@ -27,6 +28,21 @@ class LoopExecutor:
     def is_home(self, live: LiveNode) -> bool:
         """Return whether the calling thread is the event loop's."""
         return self._bridge.on_loop_thread()
+
+    def thread_id(self, live: LiveNode) -> int | None:
+        """Return the event loop's thread."""
+        return self._bridge.thread_id
+
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return the release that waits for the loop."""
+        return self._cycle.due_ns(live, now_ns)
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where the loop's thread is."""
+        return stack_of_thread(self._bridge.thread_id)
+
+    def isolate(self, live: LiveNode) -> None:
+        """Do nothing: a plain tick cannot be cut short, and nobody waits for its end."""
 
     def retime(self, live: LiveNode) -> None:
         """Move the node to the grid of its new rate."""

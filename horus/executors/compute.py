@@ -21,7 +21,8 @@ class ComputeThread(NodeThread):
     def __init__(self, live: LiveNode, real_time: RealTime) -> None:
         """Prepare an idle worker."""
         super().__init__(live, functools.partial(real_time.enter_worker_thread, live))
-        self.busy = False
+        self.posted_ns: int | None = None
+        """The release that the worker is busy with [ns]; None when it is idle."""
         self._run_tick = build_tick(live)
 
     def tick(self, release_ns: int) -> None:
@@ -29,7 +30,7 @@ class ComputeThread(NodeThread):
         try:
             self._run_tick(release_ns)
         finally:
-            self.busy = False
+            self.posted_ns = None
 
 
 class ComputeExecutor(ThreadExecutor[ComputeThread]):
@@ -55,14 +56,19 @@ class ComputeExecutor(ThreadExecutor[ComputeThread]):
         live.leave_service()
         self._cycle.remove(live)
 
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return the release that waits for the worker, or for the loop to hand it on."""
+        posted_ns = self.thread_of(live).posted_ns
+        return self._cycle.due_ns(live, now_ns) if posted_ns is None else posted_ns
+
     def retime(self, live: LiveNode) -> None:
         """Move the node to the grid of its new rate."""
         self._cycle.retime(live)
 
     def _release(self, live: LiveNode, release_ns: int) -> None:
         thread = self.thread_of(live)
-        if thread.busy:
+        if thread.posted_ns is not None:
             live.counters.skipped += 1
             return
-        thread.busy = True
+        thread.posted_ns = release_ns
         thread.post(functools.partial(thread.tick, release_ns))

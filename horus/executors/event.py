@@ -14,6 +14,7 @@ from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
 from horus.loop.executor import Executor
 from horus.loop.realtime import RealTime
+from horus.loop.stacks import Stack
 from horus.tick_path import RunTick, build_tick
 from horus.units import to_s
 
@@ -57,6 +58,22 @@ class EventExecutor:
         """Return whether the calling thread is the node's home."""
         return self._home_of(live).is_home(live)
 
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return the arrival of the message whose tick has not begun."""
+        return self._home_of(live).due_ns(live, now_ns)
+
+    def thread_id(self, live: LiveNode) -> int | None:
+        """Return the thread that runs the node's callbacks."""
+        return self._home_of(live).thread_id(live)
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where the node's callbacks are."""
+        return self._home_of(live).stack(live)
+
+    def isolate(self, live: LiveNode) -> None:
+        """Cut a frozen tick short, if it is async."""
+        self._home_of(live).isolate(live)
+
     def dismiss(self, live: LiveNode) -> None:
         """Take the home away."""
         self._home_of(live).dismiss(live)
@@ -78,6 +95,7 @@ class Arrivals:
     def __init__(self, live: LiveNode) -> None:
         """Begin with no messages."""
         assert live.trigger is not None
+        self._live = live
         self.trigger = live.trigger
         self._now_ns = live.timeline.now_ns
         self._instants: deque[int] = deque(maxlen=live.trigger.capacity)
@@ -90,6 +108,19 @@ class Arrivals:
         """Return the arrival of the message whose turn it is [ns]."""
         # A message may be queued and not yet noted: its sender is between the two.
         return self._instants[0] if self._instants else self._now_ns()
+
+    def due_ns(self) -> int | None:
+        """Return the arrival of the message that waits for its tick [ns].
+
+        None while nobody listens, or the node waits to restart. Thread: any.
+        """
+        trigger = self.trigger
+        if trigger.wake is None or not trigger.queue or self._live.resume_after_ns():
+            return None
+        try:
+            return self._instants[0]
+        except IndexError:  # taken meanwhile, or not noted yet
+            return None
 
     def forget_used(self) -> None:
         """Get in step with the queue after a tick."""
@@ -156,6 +187,10 @@ class ThreadEventExecutor(ThreadExecutor[EventThread]):
         thread.engaged = False
         thread.unpark()
 
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return the arrival of the message whose tick has not begun."""
+        return self.thread_of(live).arrivals.due_ns()
+
     def retime(self, live: LiveNode) -> None:
         """Do nothing: messages release the node."""
 
@@ -191,6 +226,19 @@ class LoopEventExecutor(LoopExecutor):
         """Cancel an async tick in progress."""
         self._tasks.cancel(live)
 
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return the arrival of the message whose tick has not begun."""
+        runner = self._runners.get(live)
+        return None if runner is None else runner.arrivals.due_ns()
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where the node's task waits, or where the loop is."""
+        return self._tasks.stack(live)
+
+    def isolate(self, live: LiveNode) -> None:
+        """Cancel an async tick in progress, as soon as the loop is free."""
+        self._bridge.post(lambda: self._tasks.cancel(live))
+
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
         """Run a callback on the loop's thread."""
         if live.is_async:
@@ -213,8 +261,8 @@ class _EventRunner:
         self, live: LiveNode, bridge: Bridge, run_tick: RunTick | None, tasks: TaskRunner
     ) -> None:
         self._live = live
-        self._arrivals = Arrivals(live)
-        self._trigger = self._arrivals.trigger
+        self.arrivals = Arrivals(live)
+        self._trigger = self.arrivals.trigger
         self._bridge = bridge
         self._run_tick = run_tick
         self._tasks = tasks
@@ -230,7 +278,7 @@ class _EventRunner:
 
     def wake(self) -> None:
         """Take note of a message. Thread: any."""
-        self._arrivals.add()
+        self.arrivals.add()
         self._schedule()
 
     def _schedule(self) -> None:
@@ -253,7 +301,7 @@ class _EventRunner:
             self._scheduled = True
             self._bridge.loop.call_later(to_s(delay_ns), self._step)
             return
-        release_ns = self._arrivals.next_release_ns()
+        release_ns = self.arrivals.next_release_ns()
         before = EventTick(live)
         if self._run_tick is None:
             task = self._tasks.start(live, release_ns)
@@ -269,6 +317,6 @@ class _EventRunner:
 
     def _ticked(self, before: EventTick) -> None:
         before.settle()
-        self._arrivals.forget_used()
+        self.arrivals.forget_used()
         if self._trigger.queue and not self._live.retired:
             self._schedule()

@@ -104,6 +104,16 @@ class RtThread(NodeThread):
         if self.grid != self.live.grid():
             self._join_grid(min(self._release_ns, self._now_ns()))
 
+    def due_ns(self, now_ns: int) -> int | None:
+        """Return the release whose tick has not begun [ns], if it is time.
+
+        Thread: any.
+        """
+        release_ns = self._release_ns
+        if not self.engaged or release_ns > now_ns or release_ns >= self._timeline.end_ns:
+            return None
+        return release_ns
+
     def _join_grid(self, from_ns: int) -> None:
         self.grid = self.live.grid()
         self._most_lead_ns = min(self._spin_ns, self.live.period_ns // 4)
@@ -206,6 +216,14 @@ class RtExecutor(ThreadExecutor[RtThread]):
         self._introduce()
         # Nobody waits any more for one that leaves.
         thread.post(functools.partial(thread._pass_baton, clock.FOREVER_NS))
+
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return the release whose tick has not begun."""
+        return self.thread_of(live).due_ns(now_ns)
+
+    def isolate(self, live: LiveNode) -> None:
+        """Let nobody wait for a baton that does not come."""
+        self.thread_of(live)._pass_baton(clock.FOREVER_NS)
 
     def retime(self, live: LiveNode) -> None:
         """Let the thread move to the grid of the new rate."""

@@ -11,6 +11,7 @@ from typing import Generic, TypeVar
 
 from horus.executors.base import run_into
 from horus.live import LiveNode
+from horus.loop.stacks import Stack, stack_of_thread
 from horus.units import to_s
 
 T = TypeVar("T", bound="NodeThread")
@@ -116,6 +117,18 @@ class ThreadExecutor(ABC, Generic[T]):
 
     def cancel(self, live: LiveNode) -> None:
         """Do nothing: a plain tick cannot be cut short."""
+
+    def thread_id(self, live: LiveNode) -> int | None:
+        """Return the node's thread."""
+        thread = self._threads.get(live)
+        return None if thread is None else thread.ident
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where the node's thread is."""
+        return stack_of_thread(self.thread_id(live))
+
+    def isolate(self, live: LiveNode) -> None:
+        """Do nothing: a plain tick cannot be cut short, and nobody waits for its end."""
 
     def is_home(self, live: LiveNode) -> bool:
         """Return whether the calling thread is the node's."""

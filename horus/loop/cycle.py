@@ -68,6 +68,14 @@ class Cycle:
         self._releases.retime(live, self._now_ns())
         self._arm()
 
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return the release of `live` that waits for the loop [ns], if there is one.
+
+        Thread: any.
+        """
+        due_ns = self._releases.due_ns(live, now_ns)
+        return due_ns if due_ns is not None and due_ns < self._timeline.end_ns else None
+
     def close(self) -> None:
         """Release nothing more."""
         self._releases.clear()

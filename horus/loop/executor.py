@@ -6,9 +6,29 @@ from concurrent.futures import Future
 from typing import Protocol
 
 from horus.live import LiveNode
+from horus.loop.stacks import Stack
 
 
-class Executor(Protocol):
+class Home(Protocol):
+    """What supervision asks of the place where a node runs.
+
+    Thread: any.
+    """
+
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return the earliest release whose tick is due and has not begun [ns], if there is one."""
+
+    def thread_id(self, live: LiveNode) -> int | None:
+        """Return the thread that runs the node's callbacks; None while nobody does."""
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where the node's callbacks are, or what keeps them from their thread."""
+
+    def isolate(self, live: LiveNode) -> None:
+        """Let nobody wait for a frozen node, and cut its tick short where that is possible."""
+
+
+class Executor(Home, Protocol):
     """Runs the callbacks of its nodes, each node's one at a time, in the node's home.
 
     The home is a thread: the event loop's for BestEffort, Event and AsyncIo

@@ -47,12 +47,22 @@ class StepLoop:
         self._workers = ThreadPoolExecutor(thread_name_prefix="horus-to-thread")
         loop.set_default_executor(self._workers)
         self._helper: ThreadPoolExecutor | None = None
+        self.running: tuple[asyncio.Task[Any], int] | None = None
+        """The task that `run` is running, and on which thread."""
 
     def run(self, work: Coroutine[Any, Any, T], context: contextvars.Context | None = None) -> T:
         """Run a coroutine to its end and return its result."""
         task = self.loop.create_task(work, context=context)
+
+        def run() -> None:
+            self.running = (task, threading.get_ident())
+            try:
+                self.loop.run_until_complete(task)
+            finally:
+                self.running = None
+
         try:
-            self.step(lambda: self.loop.run_until_complete(task))
+            self.step(run)
         except KeyboardInterrupt:
             # The loop was left in the middle of a step: let the work end in order.
             task.cancel()
@@ -60,6 +70,15 @@ class StepLoop:
                 self.step(lambda: self.loop.run_until_complete(task))
             raise
         return task.result()
+
+    def cancel(self) -> None:
+        """Cancel the task that `run` is running, if it is.
+
+        Thread: any.
+        """
+        running = self.running
+        if running is not None:
+            self.loop.call_soon_threadsafe(running[0].cancel)
 
     def step(self, run: Callable[[], object]) -> None:
         """Call something that runs the loop."""

@@ -21,7 +21,7 @@ from horus.spec import SchedulerSpec
 
 _log = logging.getLogger("horus.scheduler")
 
-_SUPERVISOR_PRIORITY = 95
+_SUPERVISOR_PRIORITY, _HOOK_PRIORITY = 95, 90
 _LOWEST_PRIORITY, _HIGHEST_PRIORITY = 50, 89
 _TIMER_SLACK_NS = 1
 _NOT_LOCKED = (
@@ -112,10 +112,16 @@ class RealTime:
                 os_rt.run_first()
 
     def enter_supervisor_thread(self) -> None:
-        """Put supervision above every node."""
+        """Put supervision, and the threads that it starts, above every node."""
         if self._rt:
             with contextlib.suppress(OSError):
-                os_rt.run_fifo(_SUPERVISOR_PRIORITY)
+                os_rt.run_fifo(_SUPERVISOR_PRIORITY, inherited=True)
+
+    def enter_hook_thread(self) -> None:
+        """Put a safe-state hook above every node and below supervision."""
+        if self._rt:
+            with contextlib.suppress(OSError):
+                os_rt.run_fifo(_HOOK_PRIORITY)
 
     @contextlib.contextmanager
     def in_loop_thread(self) -> Iterator[None]:

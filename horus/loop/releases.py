@@ -48,6 +48,17 @@ class ReleaseQueue:
             heapq.heappop(self._heap)
         return self._heap[0][0] if self._heap else None
 
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return the release of `live` that is due and was not handed out yet [ns].
+
+        Thread: any.
+        """
+        release = self._of_node.get(live)
+        if release is None:
+            return None
+        due_ns = release.grid.at(release.index)
+        return due_ns if due_ns <= now_ns else None
+
     def add(self, live: LiveNode, rank: Rank, from_ns: int, last_ns: int = clock.NEVER) -> None:
         """Queue the first release of `live` at or after `from_ns`, and after `last_ns` [ns]."""
         self.remove(live)

@@ -18,11 +18,12 @@ from horus.clock import Timeline
 from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
-from horus.loop.executor import Executor
+from horus.loop.executor import Executor, Home
 from horus.loop.gil import prompt_switching
 from horus.loop.realtime import RealTime
+from horus.loop.safety import Safety
 from horus.loop.shutdown import begin_shutdown, quiesce, shut_down
-from horus.loop.supervisor import Supervisor, collect_garbage, report_blocked_loop
+from horus.loop.supervisor import Supervisor, collect_garbage
 from horus.spec import ExecutionClass, NodeState
 from horus.units import NS_PER_MS, to_s
 
@@ -34,7 +35,7 @@ Members = Callable[[], Iterable[LiveNode]]
 
 
 class Runtime:
-    """Owns what real-time runs need: loop hooks, homes, supervisor.
+    """Owns what real-time runs need: loop hooks and the nodes' homes.
 
     `play` runs the nodes for a while, again and again if need be; their homes,
     and what `init()` opened in them, stay until `close`.
@@ -45,16 +46,18 @@ class Runtime:
 
     def __init__(
         self,
-        name: str,
         timeline: Timeline,
         real_time: RealTime,
+        supervisor: Supervisor,
+        safety: Safety,
         make_executors: MakeExecutors,
         shutdown_timeout_ns: int,
     ) -> None:
         """Describe a run; nothing happens before `play`."""
-        self._name = name
         self._timeline = timeline
         self._real_time = real_time
+        self._supervisor = supervisor
+        self._safety = safety
         self._make_executors = make_executors
         self._shutdown_timeout_ns = shutdown_timeout_ns
         self._resources = contextlib.ExitStack()
@@ -141,7 +144,7 @@ class Runtime:
         thread_id = None if bridge is None else bridge.thread_id
         if thread_id not in (None, threading.get_ident()):
             self._supervisor.spawn(
-                lambda: report_blocked_loop(
+                lambda: self._supervisor.report_blocked_loop(
                     thread_id, self._reacted, to_s(self._shutdown_timeout_ns)
                 )
             )
@@ -196,6 +199,18 @@ class Runtime:
         home = self._homes.get(live)
         return home is not None and home.is_home(live)
 
+    @property
+    def bridge(self) -> Bridge | None:
+        """The way into the event loop; None before the first play and after the last."""
+        return self._bridge
+
+    def members(self) -> list[tuple[LiveNode, Home]]:
+        """Return the nodes that have a home.
+
+        Thread: any.
+        """
+        return list(self._homes.copy().items())
+
     def _post(self, note: Callable[[], None]) -> None:
         """Do something on the loop's thread: now if this is it, else soon.
 
@@ -222,9 +237,7 @@ class Runtime:
         # now, not after the first release.
         anyio.current_effective_deadline()
         self._resources.enter_context(self._real_time.in_loop_thread())
-        self._supervisor = Supervisor(self._name, self._real_time.enter_supervisor_thread)
         self._supervisor.start()
-        self._resources.callback(self._supervisor.close)
         bridge = Bridge(asyncio.get_running_loop())
         self._resources.callback(bridge.close)
         cycle = Cycle(bridge.loop, self._timeline)
@@ -272,7 +285,9 @@ class Runtime:
 
     def _engage_one(self, live: LiveNode, from_ns: int) -> None:
         if live.initialized and not live.removed and not self._stop_requested:
+            self._safety.join(live)
             self._homes[live].engage(live, from_ns)
+            self._supervisor.poke()
 
     async def _until_stopped(self) -> None:
         timeline = self._timeline

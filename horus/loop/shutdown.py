@@ -13,6 +13,9 @@ from horus.live import LiveNode
 from horus.loop.executor import Executor
 from horus.units import to_s
 
+_HOOK_PATIENCE_MS = 100
+"""How long `shutdown()` of a node waits for its safe-state hook [ms]."""
+
 
 async def quiesce(
     homes: Mapping[LiveNode, Executor], timeout_ns: int, *, cancel: bool
@@ -51,6 +54,10 @@ async def shut_down(
 
 
 async def _shut_down_one(live: LiveNode, home: Executor | None, timeout_ns: int) -> None:
+    for _ in range(_HOOK_PATIENCE_MS):
+        if live.hook_returned.is_set():
+            break
+        await asyncio.sleep(0.001)
     shutdown = asyncio.wrap_future(begin_shutdown(live, home))
     done, _ = await asyncio.wait([shutdown], timeout=to_s(timeout_ns))
     if not done:

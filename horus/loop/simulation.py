@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 from collections.abc import Callable, Collection, Iterable
 
-from horus.clock import SimClock, Timeline
+from horus.clock import FOREVER_NS, SimClock, Timeline
 from horus.errors import StateError
 from horus.graph import contradictions, dataflow_order
 from horus.live import EventTick, LiveNode
 from horus.loop.private_loop import VirtualLoop
 from horus.loop.releases import ReleaseQueue
+from horus.loop.safety import Safety
+from horus.loop.stacks import Stack, stack_of_task, stack_of_thread
 from horus.loop.stepping import Stepper
+from horus.loop.supervision import Supervision
 from horus.units import to_s
 
 _log = logging.getLogger("horus.scheduler")
@@ -29,6 +33,7 @@ class Simulation(Stepper):
         while something happens before the end:
             move the clock to the earliest release or timer
             let async ticks go on whose sleep is over
+            let the watchdog look at those that still wait
             for each node released at this instant, in execution order:
                 tick it; an async tick starts and goes on until it awaits
                 tick the event nodes whose messages have arrived
@@ -41,10 +46,16 @@ class Simulation(Stepper):
     """
 
     def __init__(
-        self, timeline: Timeline, sim_clock: SimClock, stopped: Callable[[], bool]
+        self,
+        timeline: Timeline,
+        sim_clock: SimClock,
+        stopped: Callable[[], bool],
+        safety: Safety,
+        supervision: Supervision,
     ) -> None:
         """Begin at the clock's instant, with no nodes."""
-        super().__init__(timeline, self._virtual_loop, stopped)
+        super().__init__(timeline, self._virtual_loop, stopped, safety)
+        self._supervision = supervision
         self._clock = sim_clock
         self._begun = False
         self._releases = ReleaseQueue()
@@ -55,11 +66,11 @@ class Simulation(Stepper):
 
     # -- membership ---------------------------------------------------------------
 
-    def take_on(self, lives: tuple[LiveNode, ...]) -> None:
+    def take_on(self, lives: tuple[LiveNode, ...]) -> bool:
         """Make the nodes that are new ready to tick; the first call begins the release grid."""
-        super().take_on(lives)
+        news = super().take_on(lives)
         if self._begun:
-            return
+            return news
         self._begun = True
         self.timeline.begin(self._clock.now_ns())
         self._find_order()
@@ -73,6 +84,7 @@ class Simulation(Stepper):
                 edge.publisher,
                 edge.topic,
             )
+        return news
 
     def retime(self, live: LiveNode) -> None:
         """Move a node to the grid of its changed rate."""
@@ -146,6 +158,8 @@ class Simulation(Stepper):
                     break
                 self._clock.advance_to(instant_ns)
                 self._settle()
+                if self._in_flight:
+                    self._supervision.inspect()
                 self._deliver(only)
                 while not self.stopped() and (due := self._releases.pop_due(instant_ns)):
                     live, release_ns = due
@@ -177,7 +191,10 @@ class Simulation(Stepper):
 
     def _next_ns(self) -> int | None:
         timer_ns = self._virtual.next_timer_ns if self._virtual is not None else None
-        return min((t for t in (self._releases.next_ns, timer_ns) if t is not None), default=None)
+        # A tick takes time only if it awaits something: else there is nothing to watch.
+        look_ns = self._supervision.next_ns if self._in_flight else None
+        instants = (self._releases.next_ns, timer_ns, look_ns)
+        return min((t for t in instants if t is not None and t != FOREVER_NS), default=None)
 
     # -- ticks ----------------------------------------------------------------------
 
@@ -206,6 +223,41 @@ class Simulation(Stepper):
                 self._virtual.settle()
             finally:
                 self._callback_ended()
+
+    # -- supervision -----------------------------------------------------------------
+
+    def thread_id(self, live: LiveNode) -> int | None:
+        """Return None: no tick keeps another from its thread."""
+        return None
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where an async tick waits."""
+        task = self._in_flight.get(live)
+        return stack_of_thread(None) if task is None else stack_of_task(task, None)
+
+    def isolate(self, live: LiveNode) -> None:
+        """Cancel an async tick."""
+        task = self._in_flight.get(live)
+        if task is not None:
+            task.cancel()
+            self._settle()
+
+    def call_hooks(self, lives: Iterable[LiveNode]) -> None:
+        """Call safe-state hooks: plain ones here and now, async ones begin."""
+        for live in lives:
+            if not live.is_async:
+                live.context.copy().run(live.run_phase, "safe_state")
+                live.hook_returned.set()
+                continue
+            task = self._virtual_loop().loop.create_task(
+                live.run_phase_async("safe_state"),
+                name=f"horus-safe-state:{live.name}",
+                context=live.context.copy(),
+            )
+            task.add_done_callback(functools.partial(_hook_returned, live))
+        self._settle()
+
+    # -- delivery --------------------------------------------------------------------
 
     def _deliver(self, only: Collection[LiveNode] | None) -> None:
         """Tick event nodes, one per message, until no message waits."""
@@ -245,3 +297,7 @@ class Simulation(Stepper):
             before.settle()
         else:
             task.add_done_callback(lambda _: before.settle())
+
+
+def _hook_returned(live: LiveNode, _: object) -> None:
+    live.hook_returned.set()

@@ -6,6 +6,8 @@ each node's tick path, and a private event loop for the async ones.
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
@@ -14,7 +16,10 @@ from concurrent.futures import Future
 from horus import clock
 from horus.clock import Timeline
 from horus.live import EventTick, LiveNode
+from horus.loop.executor import Home
 from horus.loop.private_loop import StepLoop, StuckError
+from horus.loop.safety import Safety
+from horus.loop.stacks import Stack, stack_of_task, stack_of_thread
 from horus.spec import NodeState
 from horus.tick_path import RunTick, RunTickAsync, build_async_tick, build_tick
 
@@ -30,6 +35,7 @@ class Stepper:
         timeline: Timeline,
         step_loop: Callable[[], StepLoop],
         stopped: Callable[[], bool],
+        safety: Safety,
     ) -> None:
         """Begin with no nodes.
 
@@ -37,10 +43,12 @@ class Stepper:
             timeline: The scheduler's time.
             step_loop: Returns the event loop of the async nodes.
             stopped: Asked between callbacks whether to end early.
+            safety: Told of nodes that begin to take part.
         """
         self.timeline = timeline
         self.step_loop = step_loop
         self.stopped = stopped
+        self._safety = safety
         self._plain: dict[LiveNode, RunTick] = {}
         self._async: dict[LiveNode, RunTickAsync] = {}
         self._in_order: tuple[LiveNode, ...] = ()
@@ -52,15 +60,19 @@ class Stepper:
         self._lock = threading.RLock()
         self._changes: deque[Callable[[], object]] = deque()
 
-    def take_on(self, lives: tuple[LiveNode, ...]) -> None:
-        """Make the nodes that are new ready to tick, calling `init()`, in order."""
+    def take_on(self, lives: tuple[LiveNode, ...]) -> bool:
+        """Make the nodes that are new ready to tick, calling `init()`, in order.
+
+        Return whether there are any.
+        """
         if lives is self._taken_on:
-            return
+            return False
         clock.set_ambient(self.timeline)
         for live in lives:
             if not self.stopped():
                 self._add(live)
         self._taken_on = lives
+        return True
 
     def add(self, live: LiveNode) -> None:
         """Let a node take part that was added while others tick.
@@ -100,7 +112,9 @@ class Stepper:
         self._depth += 1
         try:
             if live.is_async:
-                self.step_loop().run(self._async[live](release_ns), live.context)
+                # Cancelled: it was frozen, and is isolated.
+                with contextlib.suppress(asyncio.CancelledError):
+                    self.step_loop().run(self._async[live](release_ns), live.context)
             else:
                 self._plain[live](release_ns)
         finally:
@@ -159,6 +173,30 @@ class Stepper:
             self.run_phase(live, "shutdown")
             live.stopped()
 
+    # -- what supervision asks -----------------------------------------------------
+
+    def members(self) -> list[tuple[LiveNode, Home]]:
+        """Return the nodes that take part. Thread: any."""
+        return [(live, self) for live in self._in_order]
+
+    def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
+        """Return None: a step that is not taken is not owed."""
+        return None
+
+    def thread_id(self, live: LiveNode) -> int | None:
+        """Return the thread that drives. Thread: any."""
+        return self._driver
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where the tick in progress is. Thread: any other."""
+        step = self.step_loop().running if live.is_async else None
+        return stack_of_thread(self._driver) if step is None else stack_of_task(*step)
+
+    def isolate(self, live: LiveNode) -> None:
+        """Cancel an async tick, so that the step can end. Thread: any other."""
+        if live.is_async:
+            self.step_loop().cancel()
+
     def close(self) -> None:
         """Give back what is the stepper's own."""
 
@@ -174,6 +212,7 @@ class Stepper:
         if live.removed:
             self.shut_down_one(live)
             return
+        self._safety.join(live)
         live.enter_service()
         self._put_in_order((*self._in_order, live))
 

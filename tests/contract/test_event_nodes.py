@@ -216,7 +216,6 @@ def test_an_async_event_node_is_awaited_one_message_at_a_time(make, loop):
 
 
 @pytest.mark.realtime
-@pytest.mark.filterwarnings("ignore::horus.UnavailableWarning")
 @pytest.mark.parametrize("urgency", [{"priority": 90}, {"budget": 0.5}, {"deadline": 0.5}], ids=str)
 def test_an_urgent_event_node_is_never_behind_a_slow_logger(make, loop, urgency):
     """Event node with priority, budget or deadline: a thread of its own, as for an e-stop."""

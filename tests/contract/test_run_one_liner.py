@@ -11,7 +11,7 @@ import time
 import pytest
 
 import horus
-from horus import ConfigError, Node, Scheduler, UnavailableWarning, us
+from horus import ConfigError, Node, Scheduler, us
 
 from .helpers import nothing
 
@@ -57,8 +57,7 @@ def test_the_one_liner_of_the_contract_runs():
     )
     motor = horus.Node(name="motor", tick=drive, rate=1000, order=20, budget=300 * us, subs=["cmd"])
 
-    with pytest.warns(UnavailableWarning):
-        horus.run(sensor, ctrl, motor, rt=True, watchdog_ms=500, duration=0.4)
+    horus.run(sensor, ctrl, motor, rt=True, watchdog_ms=500, duration=0.4)
 
     assert driven[0] == {"linear": 0.5, "angular": 1.0}
     assert 3 <= len(driven) <= 5

@@ -9,7 +9,7 @@ import time
 import pytest
 
 import horus
-from horus import ConfigError, Node, UnavailableWarning, UnknownNodeError, ms
+from horus import ConfigError, Node, UnknownNodeError, ms
 
 from .helpers import (
     KINDS,
@@ -443,11 +443,12 @@ def test_an_application_mutates_beside_arun(make, loop):
 # -- add_critical_node -------------------------------------------------------------------------
 
 
-def test_add_critical_node_knows_its_node_and_says_what_is_missing(make):
-    """add_critical_node() checks the name, and does not pretend to supervise yet."""
+def test_add_critical_node_knows_its_node_and_checks_its_timeout(make):
+    """add_critical_node() refuses an unknown name, and a timeout that is none."""
     sched = make()
     sched.add(Node("motor_controller", nothing))
     with pytest.raises(UnknownNodeError, match="motor_controler"):
         sched.add_critical_node("motor_controler", timeout_ms=500)
-    with pytest.warns(UnavailableWarning, match="motor_controller"):
-        sched.add_critical_node("motor_controller", timeout_ms=500)
+    with pytest.raises(ConfigError, match="timeout_ms"):
+        sched.add_critical_node("motor_controller", timeout_ms=0)
+    sched.add_critical_node("motor_controller", timeout_ms=500)

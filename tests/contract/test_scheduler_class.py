@@ -84,7 +84,6 @@ def test_the_scheduler_of_the_contract_can_be_created():
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        ("watchdog_ms", 500),
         ("blackbox_mb", 16),
         ("recording", True),
         ("telemetry", "http://127.0.0.1:9/metrics"),
@@ -94,12 +93,6 @@ def test_an_argument_whose_work_is_not_there_yet_says_so_plainly(option, value):
     """Nothing pretends: an argument without effect in this version warns and names itself."""
     with pytest.warns(UnavailableWarning, match=option):
         Scheduler(**{option: value})
-
-
-def test_a_node_argument_whose_work_is_not_there_yet_says_so_plainly():
-    """Nothing pretends: a node's argument without effect warns by the time it would count."""
-    with pytest.warns(UnavailableWarning, match="watchdog"):
-        Scheduler(deterministic=True).add(Node("motor", nothing, rate=100, watchdog=200 * ms))
 
 
 def test_full_rt_is_true_when_nothing_was_requested():

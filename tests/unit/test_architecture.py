@@ -16,7 +16,7 @@ LAYERS = [
     ["timing", "validation", "os_rt"],
     ["ports", "callables", "spec", "stats", "ratelimit"],
     ["clock", "logs", "snapshot"],
-    ["topics", "graph", "escalation", "stream"],
+    ["topics", "graph", "escalation", "stream", "reports"],
     ["core"],
     ["node", "live"],
     ["tick_path"],

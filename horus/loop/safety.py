@@ -1,0 +1,115 @@
+"""The safe state: nodes are told to be harmless, and held until somebody clears it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Sequence
+
+from horus.errors import StateError
+from horus.live import LiveNode
+from horus.spec import Health
+
+CallHooks = Callable[[Sequence[LiveNode]], None]
+"""Calls the safe-state hooks of nodes, one after another, each bounded in time; returns at once."""
+
+HOOK_TIMEOUT_S = 0.1
+"""How long others wait for a safe-state hook that does not return [s]."""
+
+_log = logging.getLogger("horus.supervisor")
+
+
+class Safety:
+    """Holds nodes, calls their safe-state hooks once, and lets them go again.
+
+    A node that is held does not tick: its releases are skipped and counted. The
+    gate is closed first, for all of them, and then the hooks are called: what a
+    hook has commanded is not undone by a later tick.
+
+    Thread: any.
+    """
+
+    def __init__(self, call_hooks: CallHooks) -> None:
+        """Begin with nobody held."""
+        self._call_hooks = call_hooks
+        self._lock = threading.Lock()
+        self.reason: str | None = None
+        """Why the system-wide safe state was entered; None while it is not."""
+
+    @property
+    def active(self) -> bool:
+        """Whether the system is in its safe state."""
+        return self.reason is not None
+
+    def enter(self, reason: str, lives: Iterable[LiveNode]) -> bool:
+        """Enter the system-wide safe state; return False if it is in it already.
+
+        The hook of every node is called, in shutdown order. Nodes without one
+        tick on, so that they can report.
+        """
+        with self._lock:
+            if self.reason is not None:
+                return False
+            self.reason = reason
+        self._hold(sorted(lives, key=lambda live: live.rank, reverse=True))
+        return True
+
+    def join(self, live: LiveNode) -> None:
+        """See to it that a node that begins to take part does not tick in the safe state."""
+        if self.active:
+            self._hold([live])
+
+    def isolate(self, live: LiveNode, ticks: int) -> bool:
+        """Take a frozen node out of the schedule; return False if its tick has just ended.
+
+        Args:
+            live: The node.
+            ticks: Its count of ticks when it was found frozen.
+        """
+        owed = not live.held and live.has_hook
+        if not live.isolate(ticks):
+            return False
+        if owed:
+            self._call_hooks([live])
+        return True
+
+    def clear(self, lives: Iterable[LiveNode]) -> list[str]:
+        """Let the nodes tick again; return the names of those that cannot yet.
+
+        These are isolated nodes whose tick still does not end, and nodes whose hook
+        has not returned.
+
+        Raises:
+            StateError: A critical node is still frozen. Nothing has changed.
+        """
+        lives = tuple(lives)
+        frozen = [
+            live.name for live in lives if live.critical_ns and live.frozen_for(live.critical_ns)
+        ]
+        if self.active and frozen:
+            raise StateError(
+                f"the safe state stays: {', '.join(frozen)} is critical and still frozen"
+            )
+        self.reason = None
+        for live in lives:
+            # Hooks that have just been called have the time that they are given anyway.
+            live.hook_returned.wait(HOOK_TIMEOUT_S)
+        remain = []
+        for live in lives:
+            if not live.held:
+                continue
+            if not live.hook_returned.is_set() or (live.health is Health.ISOLATED and live.ticking):
+                remain.append(live.name)
+            else:
+                live.free()
+        _log.warning("safe state cleared%s", f"; still held: {', '.join(remain)}" if remain else "")
+        return remain
+
+    def reset(self) -> None:
+        """Forget everything: a new session begins."""
+        self.reason = None
+
+    def _hold(self, lives: Iterable[LiveNode]) -> None:
+        held = [live for live in lives if live.has_hook and live.initialized and live.hold()]
+        if held:
+            self._call_hooks(held)

@@ -1,0 +1,130 @@
+"""What supervision does about nodes that do not come to an end."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Callable
+
+from horus.live import LiveNode
+from horus.loop.hooks import Report
+from horus.loop.safety import Safety
+from horus.loop.stacks import Stack, readable_stack
+from horus.loop.watchdog import Finding, Watchdog
+from horus.spec import Health
+from horus.units import readable
+
+_log = logging.getLogger("horus.supervisor")
+
+_LEVELS = {
+    Health.HEALTHY: logging.INFO,
+    Health.WARNING: logging.WARNING,
+    Health.UNHEALTHY: logging.ERROR,
+    Health.ISOLATED: logging.ERROR,
+}
+
+
+class Supervision:
+    """Looks after the nodes: acts on what the watchdog finds, then has it logged.
+
+    ============== ================================================================
+    lasts longer   what follows
+    ============== ================================================================
+    1 x timeout    Warning: logged with the stack of what is frozen
+    2 x timeout    Unhealthy: logged as an error; its releases go by
+    3 x timeout    Isolated: taken out of the schedule, its safe-state hook is called
+    critical       the whole system enters its safe state
+    ============== ================================================================
+
+    Thread: one, which no node can block; in virtual time that of the simulation.
+    """
+
+    def __init__(
+        self,
+        watchdog: Watchdog,
+        safety: Safety,
+        now_ns: Callable[[], int],
+        report: Report,
+    ) -> None:
+        """Supervise what `watchdog` looks at."""
+        self._watchdog = watchdog
+        self._safety = safety
+        self._now_ns = now_ns
+        self._report = report
+
+    @property
+    def next_ns(self) -> int:
+        """When to `inspect` again [ns]."""
+        return self._watchdog.next_ns
+
+    def inspect(self) -> None:
+        """Find what has run out by now, and act."""
+        for finding in self._watchdog.look(self._now_ns()):
+            self._act(finding)
+
+    def _act(self, finding: Finding) -> None:
+        live, health = finding.live, finding.health
+        before = live.health
+        if finding.critical and health is Health.HEALTHY:
+            health = Health.WARNING
+        news = health is not before or health is Health.HEALTHY
+        isolated = False
+        if health is Health.ISOLATED:
+            if not self._safety.isolate(live, finding.ticks):
+                return
+            finding.home.isolate(live)
+            isolated = True
+        elif health is not before:
+            live.expire(health)
+        entered = False
+        if live.critical_ns is not None and (finding.critical or isolated):
+            reason = f"critical node {live.name} {_lasting(finding)}, longer than " + readable(
+                live.critical_ns if finding.critical else 3 * self._timeout_ns(live)
+            )
+            entered = self._safety.enter(reason, self._watchdog.watched())
+        if news or entered:
+            stack = finding.home.stack(live)
+            self._report(functools.partial(self._tell, finding, health, news, entered, stack))
+
+    def _timeout_ns(self, live: LiveNode) -> int:
+        return self._watchdog.timeout_of(live) or 0
+
+    def _limit_of(self, finding: Finding) -> str:
+        timeout_ns, critical_ns = self._timeout_ns(finding.live), finding.live.critical_ns
+        if finding.critical and critical_ns is not None and critical_ns < timeout_ns:
+            return f"its limit as a critical node is {readable(critical_ns)}"
+        return f"its watchdog timeout is {readable(timeout_ns)}"
+
+    def _tell(
+        self, finding: Finding, health: Health, news: bool, entered: bool, stack: Stack
+    ) -> None:
+        """Log what was done.
+
+        Thread: that of the reports.
+        """
+        live = finding.live
+        if entered:
+            _log.critical("safe state entered: %s", self._safety.reason)
+        if news and health is Health.HEALTHY:
+            live.emit(logging.INFO, "healthy again")
+        elif news:
+            live.emit(
+                _LEVELS[health],
+                f"{health.value}: its tick {_lasting(finding)}, "
+                f"{self._limit_of(finding)}{_CONSEQUENCES[health]}; it is in:\n"
+                f"{readable_stack(stack)}",
+            )
+
+
+_CONSEQUENCES = {
+    Health.WARNING: "",
+    Health.UNHEALTHY: "; its releases are skipped",
+    Health.ISOLATED: "; it is taken out of the schedule",
+}
+
+
+def _lasting(finding: Finding) -> str:
+    if finding.running:
+        return f"has been running for {readable(finding.lasted_ns)}"
+    waits = f"has been due for {readable(finding.lasted_ns)} and cannot begin"
+    return waits if finding.blamed is None else f"{waits} because of {finding.blamed.name}"
