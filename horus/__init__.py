@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from horus.clock import budget_remaining, dt, elapsed, now, rng_float, tick
 from horus.errors import (
+    CallbackInterrupted,
     ConfigError,
     ConfigWarning,
     HorusError,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "CallbackInterrupted",
     "ConfigError",
     "ConfigWarning",
     "ExecutionClass",

@@ -67,6 +67,17 @@ class NodeError(HorusError):
         self.phase = phase
 
 
+class CallbackInterrupted(BaseException):
+    """Raised in a callback that blocks the main thread and does not end, once the run is to.
+
+    Not an `Exception`, so that no `except Exception` in the callback holds it up.
+    """
+
+    def __init__(self) -> None:
+        """Say why."""
+        super().__init__("it blocked the event loop, and the run is to end")
+
+
 class ShutdownTimeout(HorusError):
     """A node did not finish its shutdown in the time it is given."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Iterable
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -411,6 +412,17 @@ class Scheduler:
         stats["safe_state"] = self._session.safety.active
         stats["safe_state_reason"] = self._session.safety.reason
         return stats
+
+    @property
+    def fault_log(self) -> Path | None:
+        """The file for the stacks of all threads, should Python itself stand still.
+
+        With a watchdog, `faulthandler` writes them there, from C, when supervision has
+        not run for two of the shortest timeouts, and for 1 s at least: an extension
+        computes without releasing the interpreter. None while there is no such file;
+        it goes away after the run if nothing was written to it.
+        """
+        return self._session.fault_log.path
 
     def capabilities(self) -> dict[str, Any]:
         """Return what real-time features this process may have, and facts about the machine.

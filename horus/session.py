@@ -15,19 +15,22 @@ from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.control import RunControl
 from horus.loop.executor import Home
-from horus.loop.hooks import HookCaller, Report
+from horus.loop.fault_log import FaultLog
+from horus.loop.hooks import HookCaller
+from horus.loop.inspector import Inspector
+from horus.loop.notify import Notifier, find_notifier
 from horus.loop.private_loop import StepLoop
 from horus.loop.realtime import RealTime
 from horus.loop.runtime import Runtime, uninterrupted
 from horus.loop.safety import Safety
-from horus.loop.signals import stop_on_signals
+from horus.loop.signals import SignalOwner
 from horus.loop.simulation import Simulation
+from horus.loop.stacks import in_callback
 from horus.loop.stepping import Stepper
-from horus.loop.supervision import Supervision
 from horus.loop.supervisor import Supervisor
 from horus.loop.watchdog import Watchdog
 from horus.registry import Registry
-from horus.spec import SchedulerSpec
+from horus.spec import NodeState, SchedulerSpec
 from horus.stream import MessageStream
 from horus.topics import Bus, Subscription
 from horus.units import to_s
@@ -76,6 +79,10 @@ class Session:
         self._runtime: Runtime | None = None
         self._stepper: Stepper | None = None
         self._supervisor: Supervisor | None = None
+        self._hooks = HookCaller(self.real_time.enter_hook_thread, self._bridge, self._report)
+        self._signals: SignalOwner | None = None
+        self._notifier: Notifier | None = None
+        self.fault_log = FaultLog(spec.name)
         self._watched = spec.watchdog_ns > 0
         self._streams: set[MessageStream] = set()
 
@@ -111,7 +118,10 @@ class Session:
             else:
                 runtime = self._start_runtime()
                 members = self._all if only is None else lambda: only
-                self._private_loop().run(runtime.play(members, duration_ns, final=not keeps_open))
+                play = runtime.play(
+                    members, duration_ns, final=not keeps_open, on_ready=self._ready
+                )
+                self._private_loop().run(play)
 
     async def arun(self, duration_ns: int | None) -> None:
         """Run on the running event loop until stopped, cancelled, or for a time [ns].
@@ -125,7 +135,7 @@ class Session:
                 return
             runtime = self._start_runtime()
             try:
-                await runtime.play(self._all, duration_ns, final=True)
+                await runtime.play(self._all, duration_ns, final=True, on_ready=self._ready)
             except asyncio.CancelledError:
                 self.control.request_stop("cancelled")
                 raise
@@ -192,7 +202,7 @@ class Session:
         if live.spec.watchdog_ns or live.critical_ns:
             self._watched = True
             if self._supervisor is not None:
-                self._supervisor.poke()
+                self._supervisor.look_again()
 
     def clear_safe_state(self) -> list[str]:
         """Let the nodes tick again that are held; return the names of those that cannot yet.
@@ -242,13 +252,31 @@ class Session:
             around.callback(self._become_idle)
             around.enter_context(logs.visible(install=owns_process, verbose=self._spec.verbose))
             if owns_process:
-                around.enter_context(stop_on_signals(self.control.request_stop))
+                self._signals = SignalOwner(self.control.request_stop, self._last_act, in_callback)
+                around.enter_context(self._signals.owning())
+                self._notifier = find_notifier()
+                around.callback(self._forget_process)
             around.callback(self._hand_back, keeps_open=keeps_open)
             try:
                 yield
             except KeyboardInterrupt:
                 self.control.request_stop("KeyboardInterrupt")
                 raise
+
+    def _forget_process(self) -> None:
+        self._signals = None
+        if self._notifier is not None:
+            self._notifier.close()
+            self._notifier = None
+
+    def _last_act(self) -> None:
+        """Make the robot safe before the process is forced to end."""
+        alive = (NodeState.RUNNING, NodeState.RESTARTING, NodeState.STOPPING)
+        self._hooks.call(
+            live
+            for live in reversed(self.registry.in_order)
+            if live.state in alive and live.has_hook and live.hold()
+        )
 
     def _become_idle(self) -> None:
         self._driving_thread = None
@@ -279,6 +307,7 @@ class Session:
     def _hand_back(self, *, keeps_open: bool) -> None:
         """Let others run the nodes; unless they stay initialised, they are shut down."""
         self.control.end()
+        self._tell_manager("STOPPING=1")
         try:
             if not keeps_open or self.control.failure is not None:
                 self._close()
@@ -329,6 +358,8 @@ class Session:
                 make_executors,
                 self._spec.shutdown_timeout_ns,
             )
+        signals = self._signals
+        self._runtime.way_out = signals if signals and signals.owns else None
         if self.control.stopping:
             self._runtime.request_stop()
         return self._runtime
@@ -337,18 +368,15 @@ class Session:
         if self._stepper is None:
             self._stepper = self._make_stepper()
         if self._stepper.take_on(self.registry.in_order) and self._supervisor is not None:
-            self._supervisor.poke()
+            self._supervisor.look_again()
         return self._stepper
 
     def _make_stepper(self) -> Stepper:
         if self._sim_clock is None:
             return Stepper(self.timeline, self._private_loop, self._stopping, self.safety)
-        supervision = self._make_supervision(lambda write: write())
-        return Simulation(self.timeline, self._sim_clock, self._stopping, self.safety, supervision)
-
-    def _make_supervision(self, report: Report) -> Supervision:
         watchdog = Watchdog(self._spec.watchdog_ns, self._members)
-        return Supervision(watchdog, self.safety, self.timeline.now_ns, report)
+        inspector = Inspector(watchdog, self.safety, self.timeline.now_ns, self._report)
+        return Simulation(self.timeline, self._sim_clock, self._stopping, self.safety, inspector)
 
     def _members(self) -> Sequence[tuple[LiveNode, Home]]:
         """Return the nodes that are run, each with its home. Thread: any."""
@@ -360,13 +388,33 @@ class Session:
     def _supervise(self) -> Supervisor:
         """Return the supervisor of this session, which still has to be started."""
         if self._supervisor is None:
-            real_time = self.real_time
-            supervisor = Supervisor(self._spec.name, real_time.enter_supervisor_thread)
-            supervision = self._make_supervision(supervisor.report)
-            supervisor.spawn(lambda: supervisor.watch(supervision, self.timeline.now_ns))
-            self._hooks = HookCaller(real_time.enter_hook_thread, self._bridge, supervisor.report)
-            self._supervisor = supervisor
+            self._supervisor = Supervisor(
+                self._spec,
+                self.timeline,
+                self.real_time,
+                self.safety,
+                self._members,
+                self.fault_log,
+            )
+            if self._notifier is not None:
+                self._supervisor.notify(self._notifier)
         return self._supervisor
+
+    def _report(self, write: Callable[[], None]) -> None:
+        """Log something, where that may take as long as it likes. Thread: any."""
+        supervisor = self._supervisor
+        if supervisor is None:
+            write()
+        else:
+            supervisor.report(write)
+
+    def _ready(self) -> None:
+        self._tell_manager("READY=1")
+
+    def _tell_manager(self, state: str) -> None:
+        notifier = self._notifier
+        if notifier is not None:
+            notifier.send(state)
 
     def _bridge(self) -> Bridge | None:
         runtime = self._runtime
@@ -383,6 +431,7 @@ class Session:
         """Run in virtual time on the calling thread."""
         simulation = self._open_stepper()
         assert isinstance(simulation, Simulation)
+        self._ready()
         until_ns = None if duration_ns is None else self.timeline.now_ns() + duration_ns
         simulation.advance(until_ns, only)
 
@@ -423,6 +472,7 @@ class Session:
             raise ShutdownTimeout(live.name, timeout_s) from None
 
     def _end_run(self) -> None:
+        self._tell_manager("STOPPING=1")
         runtime = self._runtime
         if runtime is not None:
             runtime.request_stop()

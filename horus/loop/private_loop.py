@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from horus.clock import SimClock
 from horus.errors import HorusError
+from horus.loop.daemon_pool import DaemonPool
 from horus.units import to_ns, to_s
 
 T = TypeVar("T")
@@ -44,7 +45,7 @@ class StepLoop:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         """Take over `loop`, which must not be running."""
         self.loop = loop
-        self._workers = ThreadPoolExecutor(thread_name_prefix="horus-to-thread")
+        self._workers = DaemonPool("horus-to-thread")
         loop.set_default_executor(self._workers)
         self._helper: ThreadPoolExecutor | None = None
         self.running: tuple[asyncio.Task[Any], int] | None = None

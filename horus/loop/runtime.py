@@ -18,12 +18,13 @@ from horus.clock import Timeline
 from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
+from horus.loop.ending import Ending, WayOut
 from horus.loop.executor import Executor, Home
 from horus.loop.gil import prompt_switching
 from horus.loop.realtime import RealTime
 from horus.loop.safety import Safety
 from horus.loop.shutdown import begin_shutdown, quiesce, shut_down
-from horus.loop.supervisor import Supervisor, collect_garbage
+from horus.loop.supervisor import Supervisor
 from horus.spec import ExecutionClass, NodeState
 from horus.units import NS_PER_MS, to_s
 
@@ -53,13 +54,15 @@ class Runtime:
         make_executors: MakeExecutors,
         shutdown_timeout_ns: int,
     ) -> None:
-        """Describe a run; nothing happens before `play`."""
+        """Describe runs; nothing happens before `play`."""
         self._timeline = timeline
         self._real_time = real_time
         self._supervisor = supervisor
         self._safety = safety
         self._make_executors = make_executors
         self._shutdown_timeout_ns = shutdown_timeout_ns
+        self.way_out: WayOut | None = None
+        """What can be done about a callback that blocks the loop, if anything."""
         self._resources = contextlib.ExitStack()
         self._homes: dict[LiveNode, Executor] = {}
         self._stuck: set[LiveNode] = set()
@@ -67,7 +70,7 @@ class Runtime:
         self._playing = False
         self._closing = False
         self._stop_requested = False
-        self._reacted = threading.Event()
+        self._ending: Ending | None = None
         self._stop_event = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
         # Re-entrant: a signal handler that stops the run may interrupt `_post`.
@@ -76,16 +79,25 @@ class Runtime:
         self._over = False
         self._notes: deque[Callable[[], None]] = deque()
 
-    async def play(self, members: Members, duration_ns: int | None, *, final: bool) -> None:
+    async def play(
+        self,
+        members: Members,
+        duration_ns: int | None,
+        *,
+        final: bool,
+        on_ready: Callable[[], None],
+    ) -> None:
         """Initialise the nodes that are new, and tick until stopped or for a time.
 
         Args:
             members: Tells the nodes that take part.
             duration_ns: How long to tick [ns]; None until stopped.
             final: Whether `close` comes next, so that async ticks need not end in peace.
+            on_ready: Called when every node is initialised and may tick.
         """
         bridge = self._bridge or self._open()
         bridge.attach()
+        self._ending = self._supervisor.see_end(bridge, self.request_stop, self.way_out)
         try:
             with contextlib.ExitStack() as while_playing:
                 await self._initialize(members())
@@ -93,12 +105,13 @@ class Runtime:
                 if any(live.spec.execution_class is ExecutionClass.RT for live in self._homes):
                     while_playing.enter_context(prompt_switching())
                 self._engage(set(members()), duration_ns)
+                on_ready()
                 await self._until_stopped()
         finally:
             self._playing = False
-            self._reacted.set()
             self._timeline.pause()
             await uninterrupted(functools.partial(self._pause, cancel=final))
+            self._ending.over()
             bridge.detach()
 
     async def depart(self, removed: Future[None]) -> None:
@@ -113,11 +126,16 @@ class Runtime:
     async def close(self) -> None:
         """Bring every node to rest in order, and give everything back."""
         self._closing = True
+        ending = None
         if self._bridge is not None:
             self._bridge.attach()
+            ending = self._supervisor.see_end(self._bridge, self.request_stop, self.way_out)
+            ending.expect()
         try:
             await uninterrupted(self._shut_down)
         finally:
+            if ending is not None:
+                ending.over()
             for live, home in self._homes.items():
                 home.dismiss(live)
             self._homes.clear()
@@ -140,14 +158,8 @@ class Runtime:
             # the last of its node.
             live.leave_service()
         self._post(self._stop_event.set)
-        bridge = self._bridge
-        thread_id = None if bridge is None else bridge.thread_id
-        if thread_id not in (None, threading.get_ident()):
-            self._supervisor.spawn(
-                lambda: self._supervisor.report_blocked_loop(
-                    thread_id, self._reacted, to_s(self._shutdown_timeout_ns)
-                )
-            )
+        if self._ending is not None:
+            self._ending.expect()
 
     def rearm(self) -> None:
         """Forget an earlier stop: another `play` is about to begin.
@@ -155,7 +167,6 @@ class Runtime:
         Thread: any, while nothing runs.
         """
         self._stop_requested = False
-        self._reacted.clear()
         self._stop_event.clear()
 
     def add(self, live: LiveNode) -> None:
@@ -247,8 +258,7 @@ class Runtime:
             self._bridge = bridge
         while self._notes:
             self._notes.popleft()()
-        if self._real_time.collects_garbage:
-            self._supervisor.spawn(collect_garbage)
+        self._supervisor.attend()
         return bridge
 
     async def _initialize(self, lives: Iterable[LiveNode]) -> None:
@@ -279,6 +289,8 @@ class Runtime:
         self._timeline.begin(self._timeline.now_ns() + _HEAD_START_NS, duration_ns)
         clock.set_ambient(self._timeline)
         self._playing = True
+        if duration_ns is not None and self._ending is not None:
+            self._ending.expect(_HEAD_START_NS + duration_ns)
         for live in self._homes:
             if live in members:
                 self._engage_one(live, self._timeline.epoch_ns)
@@ -287,7 +299,7 @@ class Runtime:
         if live.initialized and not live.removed and not self._stop_requested:
             self._safety.join(live)
             self._homes[live].engage(live, from_ns)
-            self._supervisor.poke()
+            self._supervisor.look_again()
 
     async def _until_stopped(self) -> None:
         timeline = self._timeline

@@ -11,62 +11,121 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+from horus.errors import CallbackInterrupted
+
 _log = logging.getLogger("horus.scheduler")
 _OWNED = (signal.SIGINT, signal.SIGTERM)
-
 
 _LAST_WORDS_S = 0.3
 """How long the log may take to reach the terminal before the process ends [s]."""
 
+_LAST_ACTS_S = 1.0
+"""How long safe-state hooks may take, all together, before the process ends [s]."""
 
-@contextlib.contextmanager
-def stop_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
-    """Turn the first SIGINT or SIGTERM into `stop(reason)`, and let a second one force exit.
+InCallback = Callable[[FrameType | None], bool]
 
-    The previous handlers come back afterwards. Only the main thread can own
-    signals; in another one nothing is changed.
+
+class SignalOwner:
+    """Turns the first SIGINT or SIGTERM into a stop, and lets a second one force exit.
 
     Python-level handlers, not `loop.add_signal_handler`: they also run while a
     node's Python code blocks the loop, and they can be put back as they were
     (`remove_signal_handler` installs the default instead).
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    received: list[int] = []
 
-    def handle(number: int, frame: FrameType | None) -> None:
-        if received:
-            _force_exit(number)
-        received.append(number)
-        stop(f"received {signal.Signals(number).name}")
+    def __init__(
+        self, stop: Callable[[str], None], last_act: Callable[[], None], in_callback: InCallback
+    ) -> None:
+        """Own the signals from `owning` on.
 
-    previous = {number: signal.signal(number, handle) for number in _OWNED}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            # None: installed from C, out of Python's reach to put back.
-            if handler is not None:
-                signal.signal(number, handler)
+        Args:
+            stop: Ends the run in order, for a reason.
+            last_act: Makes the robot safe before the process is forced to end.
+            in_callback: Tells whether a frame of the main thread is in a node's callback.
+        """
+        self._stop = stop
+        self._last_act = last_act
+        self._in_callback = in_callback
+        self._received = 0
+        self._interrupting = False
+        self.owns = False
+        """Whether the signals are ours: only the main thread can own them."""
+
+    @contextlib.contextmanager
+    def owning(self) -> Iterator[None]:
+        """Own the signals in the block; the previous handlers come back afterwards."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        previous = {number: signal.signal(number, self._handle) for number in _OWNED}
+        self.owns = True
+        try:
+            yield
+        finally:
+            self.owns = False
+            for number, handler in previous.items():
+                # None: installed from C, out of Python's reach to put back.
+                if handler is not None:
+                    signal.signal(number, handler)
+
+    def interrupt(self) -> None:
+        """Raise `CallbackInterrupted` in the callback that occupies the main thread.
+
+        A system call that it waits in returns early for that; if it computes in an
+        extension, nothing happens until that returns.
+
+        Thread: any other.
+        """
+        if self.owns:
+            self._interrupting = True
+            main = threading.main_thread().ident
+            assert main is not None
+            signal.pthread_kill(main, signal.SIGTERM)
+
+    def force_exit(self, why: str) -> None:
+        """End the process with the exit code of the signal that was received, else 1."""
+        _end(128 + self._received if self._received else 1, why, self._last_act)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self._interrupting:
+            self._interrupting = False
+            # Anywhere else an exception would hit what only just keeps order.
+            if self._in_callback(frame):
+                raise CallbackInterrupted
+            return
+        if self._received:
+            _end(128 + number, f"{signal.Signals(number).name} again", self._last_act)
+            while True:
+                signal.pause()
+        self._received = number
+        self._stop(f"received {signal.Signals(number).name}")
 
 
-def _force_exit(number: int) -> None:
-    """End the process, with what the log still has to say if that can be said.
+def _end(code: int, why: str, last_act: Callable[[], None]) -> None:
+    """End the process, after what can still be done for the robot and said to its people.
 
-    The end comes first, and from C: stderr may block, and whatever the signal has
-    interrupted may hold any lock.
+    The end is certain, and comes from C: a hook may hang, stderr may block, and
+    whatever the signal has interrupted may hold any lock.
     """
-    _thread.start_new_thread(_end_process, (128 + number,))
-    _thread.start_new_thread(
-        _log.critical, ("%s again: exiting at once", signal.Signals(number).name)
-    )
-    while True:
-        signal.pause()
+    _thread.start_new_thread(_end_process, (code, last_act))
+    _thread.start_new_thread(_log.critical, ("%s: exiting at once", why))
 
 
-def _end_process(code: int) -> None:
-    pause = _thread.allocate_lock()
-    pause.acquire()
-    pause.acquire(True, _LAST_WORDS_S)
-    os._exit(code)
+def _end_process(code: int, last_act: Callable[[], None]) -> None:
+    try:
+        acted = _thread.allocate_lock()
+        acted.acquire()
+
+        def act() -> None:
+            try:
+                last_act()
+            finally:
+                acted.release()
+
+        _thread.start_new_thread(act, ())
+        acted.acquire(True, _LAST_ACTS_S)
+        pause = _thread.allocate_lock()
+        pause.acquire()
+        pause.acquire(True, _LAST_WORDS_S)
+    finally:
+        os._exit(code)

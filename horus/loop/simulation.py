@@ -11,12 +11,12 @@ from horus.clock import FOREVER_NS, SimClock, Timeline
 from horus.errors import StateError
 from horus.graph import contradictions, dataflow_order
 from horus.live import EventTick, LiveNode
+from horus.loop.inspector import Inspector
 from horus.loop.private_loop import VirtualLoop
 from horus.loop.releases import ReleaseQueue
 from horus.loop.safety import Safety
 from horus.loop.stacks import Stack, stack_of_task, stack_of_thread
 from horus.loop.stepping import Stepper
-from horus.loop.supervision import Supervision
 from horus.units import to_s
 
 _log = logging.getLogger("horus.scheduler")
@@ -51,11 +51,11 @@ class Simulation(Stepper):
         sim_clock: SimClock,
         stopped: Callable[[], bool],
         safety: Safety,
-        supervision: Supervision,
+        inspector: Inspector,
     ) -> None:
         """Begin at the clock's instant, with no nodes."""
         super().__init__(timeline, self._virtual_loop, stopped, safety)
-        self._supervision = supervision
+        self._inspector = inspector
         self._clock = sim_clock
         self._begun = False
         self._releases = ReleaseQueue()
@@ -159,7 +159,7 @@ class Simulation(Stepper):
                 self._clock.advance_to(instant_ns)
                 self._settle()
                 if self._in_flight:
-                    self._supervision.inspect()
+                    self._inspector.inspect()
                 self._deliver(only)
                 while not self.stopped() and (due := self._releases.pop_due(instant_ns)):
                     live, release_ns = due
@@ -192,7 +192,7 @@ class Simulation(Stepper):
     def _next_ns(self) -> int | None:
         timer_ns = self._virtual.next_timer_ns if self._virtual is not None else None
         # A tick takes time only if it awaits something: else there is nothing to watch.
-        look_ns = self._supervision.next_ns if self._in_flight else None
+        look_ns = self._inspector.next_ns if self._in_flight else None
         instants = (self._releases.next_ns, timer_ns, look_ns)
         return min((t for t in instants if t is not None and t != FOREVER_NS), default=None)
 

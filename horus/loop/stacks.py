@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 import traceback
 from collections.abc import Iterator
@@ -10,10 +11,15 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-_TICK_PATH = str(Path(__file__).resolve().parent.parent / "tick_path.py")
+_PACKAGE = str(Path(__file__).resolve().parent.parent) + os.sep
+_CALLERS = ("run_tick", "call", "run_phase_async")
+"""The functions of ours that call or await a node's callbacks."""
 
 Stack = traceback.StackSummary
-"""Lines of code, innermost call last. Source files are read when it is formatted, not before."""
+"""Lines of code, innermost call last; of a callback, only what is the node's own.
+
+Source files are read when it is formatted, not before.
+"""
 
 
 def stack_of_thread(thread_id: int | None) -> Stack:
@@ -47,12 +53,33 @@ def stack_of_task(task: asyncio.Task[Any], thread_id: int | None) -> Stack:
     return _capture(iter(frames))
 
 
+def in_callback(frame: FrameType | None) -> bool:
+    """Return whether a thread that is at `frame` executes code of a node's callback.
+
+    Not what the callback has called of ours: there, locks may be held.
+    """
+    if frame is None or _is_ours(frame):
+        return False
+    caller: FrameType | None = frame
+    while caller is not None and not _is_ours(caller):
+        caller = caller.f_back
+    return caller is not None and caller.f_code.co_name in _CALLERS
+
+
 def readable_stack(stack: Stack) -> str:
-    """Return a stack as text, as tracebacks show it; of a tick, what the node called."""
+    """Return a stack as text, as tracebacks show it."""
     return "".join(stack.format()).rstrip("\n") or "  (no Python code)"
+
+
+def _is_ours(frame: FrameType) -> bool:
+    return frame.f_code.co_filename.startswith(_PACKAGE)
 
 
 def _capture(frames: Iterator[tuple[FrameType, int]]) -> Stack:
     stack = traceback.StackSummary.extract(frames, lookup_lines=False)
-    places = [place for place, line in enumerate(stack) if line.filename == _TICK_PATH]
+    places = [
+        place
+        for place, line in enumerate(stack)
+        if line.filename.startswith(_PACKAGE) and line.name in _CALLERS
+    ]
     return Stack.from_list(stack[places[-1] + 1 :]) if places else stack

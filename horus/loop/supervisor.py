@@ -1,154 +1,152 @@
-"""The supervisor's thread, with an event loop of its own, which no node can block."""
+"""The supervisor of a session: the tasks that look after it, whatever the nodes do."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import functools
 import gc
 import itertools
 import logging
-import threading
 from collections.abc import Callable, Coroutine
-from queue import SimpleQueue
 from typing import Any
 
-from horus.clock import FOREVER_NS
-from horus.loop.stacks import readable_stack, stack_of_thread
-from horus.loop.supervision import Supervision
+from horus.clock import FOREVER_NS, Timeline
+from horus.live import LiveNode
+from horus.loop.bridge import Bridge
+from horus.loop.ending import Ending, WayOut
+from horus.loop.fault_log import FaultLog
+from horus.loop.inspector import Inspector
+from horus.loop.notify import Notifier
+from horus.loop.pace import Pace
+from horus.loop.realtime import RealTime
+from horus.loop.safety import Safety
+from horus.loop.supervisor_thread import SupervisorThread
+from horus.loop.watchdog import Members, Watchdog
+from horus.spec import Health, SchedulerSpec
 from horus.units import to_s
 
 _log = logging.getLogger("horus.supervisor")
 
-_SECONDS_PER_FULL_COLLECTION = 60
 _SHORTEST_SLEEP_S = 0.001
-_LAST_REPORTS_S = 1.0
-"""How long the log may take to accept the last reports [s]."""
+_SECONDS_PER_FULL_COLLECTION = 60
 
 
 class Supervisor:
-    """Runs supervision tasks beside the run loop.
+    """Looks after the nodes of one session on a thread that none of them can block.
 
-    User code can block the main loop, an application's loop or an Rt thread;
-    what must happen anyway is a task here. Not even the log can hold it up: what
-    there is to report is written by yet another thread.
+    ==================  ==============================================================
+    task                what it does
+    ==================  ==============================================================
+    `_watch`            inspects the nodes when a watchdog timeout may have run out
+    `_check_pace`       says it when a node runs slower than asked
+    `Ending`            interrupts the callback that keeps a run from its end
+    `_collect_garbage`  replaces the automatic collections under `rt=True`
+    `FaultLog`          has all stacks written should Python itself stand still
+    `Notifier`          tells systemd that all is well
+    ==================  ==============================================================
 
-    Thread: any for `spawn`, `poke` and `report`; `start` and `close` belong to those
-    who drive the nodes.
+    Thread: any, except `start` and `close`, which belong to those who drive the nodes.
     """
 
-    def __init__(self, name: str, enter_thread: Callable[[], None]) -> None:
-        """Prepare the thread of the scheduler called `name`; `enter_thread` sets it up."""
-        self._enter_thread = enter_thread
-        self._loop = asyncio.new_event_loop()
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._poked = asyncio.Event()
-        self._reports: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._thread = threading.Thread(
-            target=self._serve, name=f"horus-supervisor:{name}", daemon=True
-        )
-        self._reporter = threading.Thread(
-            target=self._write_reports, name=f"horus-reports:{name}", daemon=True
-        )
+    def __init__(
+        self,
+        spec: SchedulerSpec,
+        timeline: Timeline,
+        real_time: RealTime,
+        safety: Safety,
+        members: Members,
+        fault_log: FaultLog,
+    ) -> None:
+        """Prepare; nothing is watched before `start`."""
+        self._timeline = timeline
+        self._real_time = real_time
+        self._safety = safety
+        self._members = members
+        self._fault_log = fault_log
+        self._patience_s = to_s(spec.shutdown_timeout_ns)
+        self._thread = SupervisorThread(spec.name, real_time.enter_supervisor_thread)
+        self._watchdog = Watchdog(spec.watchdog_ns, members)
+        self._inspector = Inspector(self._watchdog, safety, timeline.now_ns, self.report)
+        self._changed = asyncio.Event()
+        self._started = False
 
     def start(self) -> None:
-        """Start the threads, unless they run."""
-        if not self._thread.is_alive():
-            self._reporter.start()
-            self._thread.start()
+        """Begin to watch, unless it has begun."""
+        if self._started:
+            return
+        self._started = True
+        self._thread.start()
+        self._spawn(self._watch)
 
-    def spawn(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run a supervision task; after `close` there is nothing left to supervise."""
+    def attend(self) -> None:
+        """Look after a run loop, too."""
+        if self._real_time.collects_garbage:
+            self._spawn(_collect_garbage)
+        self._spawn(self._check_pace)
 
-        def start() -> None:
-            task = self._loop.create_task(work())
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+    def see_end(self, bridge: Bridge, stop: Callable[[], None], way_out: WayOut | None) -> Ending:
+        """See to it that a run ends; see `Ending`."""
+        return Ending(self._thread, bridge, stop, way_out, self._patience_s)
 
-        self._call(start)
+    def notify(self, notifier: Notifier) -> None:
+        """Send the service manager signs of life for as long as all is well."""
+        self._spawn(lambda: notifier.keep_alive(self._is_well))
+
+    def look_again(self) -> None:
+        """Take note that nodes have come, or that a timeout has changed."""
+        self._thread.call(self._changed.set)
 
     def report(self, write: Callable[[], None]) -> None:
         """Log something soon; return at once."""
-        self._reports.put(write)
-
-    def poke(self) -> None:
-        """Let `watch` look at once: something has changed that its next look depends on."""
-        self._call(self._poked.set)
-
-    async def watch(self, supervision: Supervision, now_ns: Callable[[], int]) -> None:
-        """Inspect the nodes whenever something may have run out. Thread: supervisor."""
-        while True:
-            self._poked.clear()
-            try:
-                supervision.inspect()
-            except Exception as exc:
-                # Supervision goes on whatever happens to it.
-                self.report(functools.partial(_log.error, "inspection failed", exc_info=exc))
-            if supervision.next_ns == FOREVER_NS:
-                await self._poked.wait()
-                continue
-            delay_s = max(_SHORTEST_SLEEP_S, to_s(supervision.next_ns - now_ns()))
-            alarm = self._loop.call_later(delay_s, self._poked.set)
-            await self._poked.wait()
-            alarm.cancel()
+        self._thread.report(write)
 
     def close(self) -> None:
-        """Cancel what runs, and end the threads."""
-        if not self._thread.is_alive():
-            self._loop.close()
-            return
-        self._call(self._loop.stop)
-        self._thread.join()
-        self._reports.put(None)
-        self._reporter.join(_LAST_REPORTS_S)
+        """Watch no more."""
+        self._thread.close()
 
-    def _call(self, call: Callable[[], object]) -> None:
-        with contextlib.suppress(RuntimeError):  # closed
-            self._loop.call_soon_threadsafe(call)
+    # -- tasks -----------------------------------------------------------------------
 
-    def _serve(self) -> None:
-        self._enter_thread()
-        try:
-            self._loop.run_forever()
-        finally:
-            pending = asyncio.all_tasks(self._loop)
-            for task in pending:
-                task.cancel()
-            if pending:
-                self._loop.run_until_complete(asyncio.gather(*pending, return_exceptions=True))
-            self._loop.close()
+    def _spawn(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        self._thread.spawn(work)
 
-    def _write_reports(self) -> None:
-        while (write := self._reports.get()) is not None:
+    async def _watch(self) -> None:
+        loop = asyncio.get_running_loop()
+        dumping: asyncio.Task[None] | None = None
+        while True:
+            self._changed.clear()
             try:
-                write()
-            except Exception:
-                _log.exception("a report could not be logged")
-
-    async def report_blocked_loop(
-        self, loop_thread_id: int, reacted: threading.Event, patience_s: float
-    ) -> None:
-        """Say where the event loop is stuck when it does not react to a stop.
-
-        Args:
-            loop_thread_id: The thread that was asked to stop.
-            reacted: Set by the loop when it begins to stop.
-            patience_s: How long to wait before each message [s].
-        """
-        while not reacted.is_set():
-            await asyncio.sleep(patience_s)
-            if not reacted.is_set():
-                stack = stack_of_thread(loop_thread_id)
-                self.report(
-                    lambda stack=stack: _log.error(  # type: ignore[misc]
-                        "the event loop has not reacted to a stop for %g s; it is blocked in:\n%s",
-                        patience_s,
-                        readable_stack(stack),
-                    )
+                self._inspector.inspect()
+            except Exception as exc:
+                # Supervision goes on whatever happens to it.
+                self.report(functools.partial(_log.error, "an inspection failed", exc_info=exc))
+            if self._inspector.next_ns == FOREVER_NS:
+                await self._changed.wait()
+                continue
+            if dumping is None:
+                dumping = loop.create_task(
+                    self._fault_log.keep_putting_off(self._watchdog.shortest_ns, self.report)
                 )
+            delay_s = to_s(self._inspector.next_ns - self._timeline.now_ns())
+            alarm = loop.call_later(max(_SHORTEST_SLEEP_S, delay_s), self._changed.set)
+            await self._changed.wait()
+            alarm.cancel()
+
+    async def _check_pace(self) -> None:
+        pace = Pace(self._lives)
+        while True:
+            for slow in pace.look(self._timeline.now_ns()):
+                self.report(slow.log)
+            await asyncio.sleep(1.0)
+
+    def _is_well(self) -> bool:
+        critical = (live for live in self._lives() if live.critical_ns is not None)
+        return not self._safety.active and all(live.health is Health.HEALTHY for live in critical)
+
+    def _lives(self) -> list[LiveNode]:
+        return [live for live, _ in self._members()]
 
 
-async def collect_garbage() -> None:
+async def _collect_garbage() -> None:
     """Collect garbage little and often, in place of the automatic collections.
 
     What a second has left behind is little, and so is the time for which other

@@ -76,6 +76,11 @@ class Watchdog:
         """Return the watchdog timeout of a node [ns]; None if it is not watched."""
         return live.spec.watchdog_ns or self._default_ns or live.critical_ns
 
+    def shortest_ns(self) -> int:
+        """Return the shortest timeout [ns]; `FOREVER_NS` if nobody is watched."""
+        timeouts = (self.timeout_of(live) for live, _ in self._members())
+        return min((timeout_ns for timeout_ns in timeouts if timeout_ns), default=FOREVER_NS)
+
     def watched(self) -> list[LiveNode]:
         """Return the nodes that take part."""
         return [live for live, _ in self._members()]

@@ -71,6 +71,7 @@ def test_only_clock_reads_the_clock() -> None:
 def test_public_names() -> None:
     """The public interface changes on purpose or not at all."""
     assert sorted(horus.__all__) == [
+        "CallbackInterrupted",
         "ConfigError",
         "ConfigWarning",
         "ExecutionClass",
@@ -111,7 +112,7 @@ def test_heavy_parts_load_lazily() -> None:
     """`import horus` loads neither an event loop nor a library that a robot may never need."""
     program = (
         "import sys, horus; "
-        "heavy = 'asyncio uvloop anyio aiohttp mcap msgspec numpy random'.split(); "
+        "heavy = 'asyncio uvloop anyio aiohttp mcap msgspec numpy platformdirs random'.split(); "
         "print([name for name in heavy if name in sys.modules])"
     )
     found = subprocess.run(

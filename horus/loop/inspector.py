@@ -1,4 +1,4 @@
-"""What supervision does about nodes that do not come to an end."""
+"""What is done about ticks that do not end."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _LEVELS = {
 }
 
 
-class Supervision:
-    """Looks after the nodes: acts on what the watchdog finds, then has it logged.
+class Inspector:
+    """Acts on what the watchdog finds, then has it logged.
 
     ============== ================================================================
     lasts longer   what follows
@@ -46,7 +46,7 @@ class Supervision:
         now_ns: Callable[[], int],
         report: Report,
     ) -> None:
-        """Supervise what `watchdog` looks at."""
+        """Act on what `watchdog` finds."""
         self._watchdog = watchdog
         self._safety = safety
         self._now_ns = now_ns
