@@ -93,10 +93,15 @@ class Watchdog:
         findings = []
         for live, home in members:
             timeout_ns = self.timeout_of(live)
-            if timeout_ns and live.initialized and live.health is not Health.ISOLATED:
-                finding = self._look_at(live, home, timeout_ns, now_ns, late_ns, holders)
-                if finding is not None:
-                    findings.append(finding)
+            if not timeout_ns or not live.initialized:
+                continue
+            if live.health is Health.ISOLATED:
+                # It may be let go right after this look.
+                self._look_again_at(now_ns + timeout_ns)
+                continue
+            finding = self._look_at(live, home, timeout_ns, now_ns, late_ns, holders)
+            if finding is not None:
+                findings.append(finding)
         if len(self._vigils) > 2 * len(members):
             self._vigils = {live: self._vigils[live] for live, _ in members if live in self._vigils}
         return findings
