@@ -187,6 +187,10 @@ class Stepper:
         """Return the thread that drives. Thread: any."""
         return self._driver
 
+    def computes(self, live: LiveNode) -> bool:
+        """Return False: nobody waits for the thread that drives."""
+        return False
+
     def stack(self, live: LiveNode) -> Stack:
         """Return where the tick in progress is. Thread: any other."""
         step = self.step_loop().running if live.is_async else None

@@ -88,7 +88,7 @@ class Watchdog:
         holders = {
             home.thread_id(live): live
             for live, home in members
-            if (live.ticking or live.reviving) and not live.is_async
+            if (live.ticking or live.reviving) and (not live.is_async or home.computes(live))
         }
         findings = []
         for live, home in members:
