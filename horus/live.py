@@ -372,6 +372,14 @@ class LiveNode:
         return NodeState.SAFE_STATE if self.held and self.initialized else self.state
 
     @property
+    def owed_from_ns(self) -> int:
+        """The instant before which no tick is owed, whatever waits [ns].
+
+        Messages wait while nothing runs, and while the node is to restart.
+        """
+        return max(self.timeline.epoch_ns, self._restart_at_ns)
+
+    @property
     def has_hook(self) -> bool:
         """Whether there is a safe-state hook."""
         return self.callbacks["safe_state"] is not None

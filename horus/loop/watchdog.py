@@ -162,10 +162,12 @@ def _begun_ns(live: LiveNode) -> int:
     A message that waited behind another one was not owed before that one's tick began.
     """
     context = live.tick_context
-    return max(context.release_ns, context.previous_ns)
+    return max(context.release_ns, context.previous_ns, live.owed_from_ns)
 
 
 def _due_ns(live: LiveNode, home: Home, now_ns: int) -> int:
     """Return since when a tick is owed that has not begun [ns]; `NEVER` if none is."""
     due_ns = home.due_ns(live, now_ns)
-    return NEVER if due_ns is None else max(due_ns, live.tick_context.start_ns)
+    if due_ns is None:
+        return NEVER
+    return max(due_ns, live.tick_context.start_ns, live.owed_from_ns)
