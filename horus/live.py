@@ -104,8 +104,8 @@ class LiveNode:
         self.hook_returned = threading.Event()
         """Whether no safe-state hook is owed or in progress since the node was held."""
         self.hook_returned.set()
-        self.reviving = False
-        """Whether `init()` runs again in place of a tick, before it restarts."""
+        self.revival_ns = clock.NEVER
+        """Since when `init()` runs again in place of a tick [ns]; `NEVER` while it does not."""
         self.reports = NodeReports(core.log, self.tick_context)
         self.callbacks = core.callbacks
         self._claims = threading.Lock()
@@ -139,6 +139,20 @@ class LiveNode:
     def ticking(self) -> bool:
         """Whether a tick is in progress."""
         return self.tick_context.ticking
+
+    @property
+    def busy_since_ns(self) -> int:
+        """Since when a tick, or `init()` in its place, is in progress [ns]; else `NEVER`."""
+        revival_ns = self.revival_ns
+        if revival_ns != clock.NEVER:
+            return revival_ns
+        # The tick path writes the start before `ticking`, so we read them the other way round.
+        return self.tick_context.start_ns if self.ticking else clock.NEVER
+
+    @property
+    def busy(self) -> bool:
+        """Whether a tick, or `init()` in its place, is in progress."""
+        return self.busy_since_ns != clock.NEVER
 
     @property
     def initialized(self) -> bool:
@@ -385,12 +399,12 @@ class LiveNode:
         return self.callbacks["safe_state"] is not None
 
     def frozen_for(self, limit_ns: int) -> bool:
-        """Return whether a tick has been running for longer than `limit_ns`.
+        """Return whether a tick, or `init()` in its place, has been running for longer.
 
         Thread: any.
         """
-        started_ns = self.tick_context.start_ns
-        return self.ticking and self.timeline.now_ns() - started_ns > limit_ns
+        since_ns = self.busy_since_ns
+        return since_ns != clock.NEVER and self.timeline.now_ns() - since_ns > limit_ns
 
     def expire(self, health: Health) -> None:
         """Take note that the watchdog has run out.

@@ -61,7 +61,7 @@ class TaskRunner:
         A safe-state hook that the tick has led to is not cut short.
         """
         tick = self._ticks.get(live)
-        if tick is not None and live.ticking and tick.task is not _current_task():
+        if tick is not None and live.busy and tick.task is not _current_task():
             tick.task.cancel()
 
     def due_ns(self, live: LiveNode) -> int | None:
@@ -87,7 +87,7 @@ class TaskRunner:
         """
         tick = self._ticks.get(live)
         thread_id = self._bridge.thread_id
-        if tick is None or not live.ticking:
+        if tick is None or not live.busy:
             return stack_of_thread(thread_id)
         return stack_of_task(tick.task, thread_id)
 

@@ -88,7 +88,7 @@ class Watchdog:
         holders = {
             home.thread_id(live): live
             for live, home in members
-            if (live.ticking or live.reviving) and (not live.is_async or home.computes(live))
+            if live.busy and (not live.is_async or home.computes(live))
         }
         findings = []
         for live, home in members:
@@ -115,11 +115,11 @@ class Watchdog:
         late_ns: int,
         holders: dict[int | None, LiveNode],
     ) -> Finding | None:
-        # The tick path writes the start before `ticking`, so we read them the other way round.
-        running = live.ticking
-        ticks = live.counters.ticks
+        ticks = live.counters.ticks  # first: if the tick ends from here on, it shows
+        busy_since_ns = live.busy_since_ns
+        running = busy_since_ns != NEVER
         since_ns = _begun_ns(live) if running else _due_ns(live, home, now_ns)
-        began_ns = live.tick_context.start_ns if running else since_ns
+        began_ns = busy_since_ns if running else since_ns
         critical_ns = live.critical_ns or FOREVER_NS
         vigil = self._vigils.setdefault(live, _Vigil())
         recovered = False
