@@ -468,13 +468,16 @@ class LiveNode:
             self.hook_returned.clear()
 
     def free(self) -> None:
-        """Let the node tick again, in good health.
+        """Let the node tick again, not isolated any more.
+
+        A tick that lasts too long already goes on doing so.
 
         Thread: any.
         """
         with self._claims:
             self.held = False
-            self.health = Health.HEALTHY
+            if self.health is Health.ISOLATED:
+                self.health = Health.HEALTHY
         self.in_episode = False
         self.regate()
 
