@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import copy
 import inspect
 import logging
 import threading
@@ -69,14 +70,21 @@ class LiveNode:
     single attributes, or set `gated` and `retired`, which are only ever looked at.
     """
 
-    def __init__(self, node: object, timeline: Timeline, control: Control, sequence: int) -> None:
-        """Put `node` into service as the `sequence`-th node added."""
+    def __init__(
+        self,
+        node: object,
+        timeline: Timeline,
+        control: Control,
+        sequence: int,
+        counters: NodeCounters | None = None,
+    ) -> None:
+        """Put `node` into service as the `sequence`-th node added; `counters` go on."""
         self.node = node
         self.core = core = core_of(node)
         self.control = control
         self.timeline = timeline
         self.sequence = sequence
-        self.counters = NodeCounters()
+        self.counters = counters or NodeCounters()
         self.state = NodeState.UNINITIALIZED
         self.health = Health.HEALTHY
         self.trigger: Subscription | None = None
@@ -284,7 +292,8 @@ class LiveNode:
 
         Whatever still runs of the old one has no say in the new one.
         """
-        fresh = LiveNode(self.node, self.timeline, self.control, self.sequence)
+        counters = copy.deepcopy(self.counters)
+        fresh = LiveNode(self.node, self.timeline, self.control, self.sequence, counters)
         fresh.trigger = self.trigger
         fresh.critical_ns = self.critical_ns
         fresh.apply(self.spec)
