@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import copy
 import inspect
 import logging
 import threading
@@ -69,14 +70,21 @@ class LiveNode:
     single attributes, or set `gated` and `retired`, which are only ever looked at.
     """
 
-    def __init__(self, node: object, timeline: Timeline, control: Control, sequence: int) -> None:
-        """Put `node` into service as the `sequence`-th node added."""
+    def __init__(
+        self,
+        node: object,
+        timeline: Timeline,
+        control: Control,
+        sequence: int,
+        counters: NodeCounters | None = None,
+    ) -> None:
+        """Put `node` into service as the `sequence`-th node added; `counters` go on."""
         self.node = node
         self.core = core = core_of(node)
         self.control = control
         self.timeline = timeline
         self.sequence = sequence
-        self.counters = NodeCounters()
+        self.counters = counters or NodeCounters()
         self.state = NodeState.UNINITIALIZED
         self.health = Health.HEALTHY
         self.trigger: Subscription | None = None
@@ -104,8 +112,8 @@ class LiveNode:
         self.hook_returned = threading.Event()
         """Whether no safe-state hook is owed or in progress since the node was held."""
         self.hook_returned.set()
-        self.reviving = False
-        """Whether `init()` runs again in place of a tick, before it restarts."""
+        self.revival_ns = clock.NEVER
+        """Since when `init()` runs again in place of a tick [ns]; `NEVER` while it does not."""
         self.reports = NodeReports(core.log, self.tick_context)
         self.callbacks = core.callbacks
         self._claims = threading.Lock()
@@ -139,6 +147,20 @@ class LiveNode:
     def ticking(self) -> bool:
         """Whether a tick is in progress."""
         return self.tick_context.ticking
+
+    @property
+    def busy_since_ns(self) -> int:
+        """Since when a tick, or `init()` in its place, is in progress [ns]; else `NEVER`."""
+        revival_ns = self.revival_ns
+        if revival_ns != clock.NEVER:
+            return revival_ns
+        # The tick path writes the start before `ticking`, so we read them the other way round.
+        return self.tick_context.start_ns if self.ticking else clock.NEVER
+
+    @property
+    def busy(self) -> bool:
+        """Whether a tick, or `init()` in its place, is in progress."""
+        return self.busy_since_ns != clock.NEVER
 
     @property
     def initialized(self) -> bool:
@@ -270,7 +292,8 @@ class LiveNode:
 
         Whatever still runs of the old one has no say in the new one.
         """
-        fresh = LiveNode(self.node, self.timeline, self.control, self.sequence)
+        counters = copy.deepcopy(self.counters)
+        fresh = LiveNode(self.node, self.timeline, self.control, self.sequence, counters)
         fresh.trigger = self.trigger
         fresh.critical_ns = self.critical_ns
         fresh.apply(self.spec)
@@ -372,17 +395,25 @@ class LiveNode:
         return NodeState.SAFE_STATE if self.held and self.initialized else self.state
 
     @property
+    def owed_from_ns(self) -> int:
+        """The instant before which no tick is owed, whatever waits [ns].
+
+        Messages wait while nothing runs, and while the node is to restart.
+        """
+        return max(self.timeline.epoch_ns, self._restart_at_ns)
+
+    @property
     def has_hook(self) -> bool:
         """Whether there is a safe-state hook."""
         return self.callbacks["safe_state"] is not None
 
     def frozen_for(self, limit_ns: int) -> bool:
-        """Return whether a tick has been running for longer than `limit_ns`.
+        """Return whether a tick, or `init()` in its place, has been running for longer.
 
         Thread: any.
         """
-        started_ns = self.tick_context.start_ns
-        return self.ticking and self.timeline.now_ns() - started_ns > limit_ns
+        since_ns = self.busy_since_ns
+        return since_ns != clock.NEVER and self.timeline.now_ns() - since_ns > limit_ns
 
     def expire(self, health: Health) -> None:
         """Take note that the watchdog has run out.
@@ -446,13 +477,16 @@ class LiveNode:
             self.hook_returned.clear()
 
     def free(self) -> None:
-        """Let the node tick again, in good health.
+        """Let the node tick again, not isolated any more.
+
+        A tick that lasts too long already goes on doing so.
 
         Thread: any.
         """
         with self._claims:
             self.held = False
-            self.health = Health.HEALTHY
+            if self.health is Health.ISOLATED:
+                self.health = Health.HEALTHY
         self.in_episode = False
         self.regate()
 

@@ -21,6 +21,7 @@ import threading
 from collections.abc import Callable, Coroutine
 from typing import Any
 
+from horus.clock import NEVER
 from horus.errors import NodeError
 from horus.escalation import Action, Outcome, decide
 from horus.live import Admission, Limits, LiveNode, being_cancelled, never_awaited
@@ -193,9 +194,9 @@ def _act(
 def _admitted(live: LiveNode) -> bool:
     admission = live.admit()
     if admission is Admission.RESTART:
-        live.reviving = True
+        live.revival_ns = live.timeline.now_ns()
         live.restarted(live.run_phase("init"))
-        live.reviving = False
+        live.revival_ns = NEVER
         admission = live.admit()
     return _counted(live, admission)
 
@@ -203,9 +204,11 @@ def _admitted(live: LiveNode) -> bool:
 async def _admitted_async(live: LiveNode) -> bool:
     admission = live.admit()
     if admission is Admission.RESTART:
-        live.reviving = True
-        live.restarted(await live.run_phase_async("init"))
-        live.reviving = False
+        live.revival_ns = live.timeline.now_ns()
+        try:
+            live.restarted(await live.run_phase_async("init"))
+        finally:
+            live.revival_ns = NEVER
         admission = live.admit()
     return _counted(live, admission)
 

@@ -23,5 +23,5 @@ def make_executors(
         ExecutionClass.EVENT: EventExecutor(bridge, cycle, real_time),
         ExecutionClass.ASYNC_IO: AsyncIoExecutor(bridge, cycle),
         ExecutionClass.RT: RtExecutor(real_time),
-        ExecutionClass.COMPUTE: ComputeExecutor(cycle, real_time),
+        ExecutionClass.COMPUTE: ComputeExecutor(bridge, cycle, real_time),
     }

@@ -11,7 +11,7 @@ from horus.executors.base import LoopExecutor
 from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
-from horus.loop.stacks import Stack, stack_of_task, stack_of_thread
+from horus.loop.stacks import Stack, computes, stack_of_task, stack_of_thread
 from horus.tick_path import RunTickAsync, build_async_tick
 
 
@@ -61,7 +61,7 @@ class TaskRunner:
         A safe-state hook that the tick has led to is not cut short.
         """
         tick = self._ticks.get(live)
-        if tick is not None and live.ticking and tick.task is not _current_task():
+        if tick is not None and live.busy and tick.task is not _current_task():
             tick.task.cancel()
 
     def due_ns(self, live: LiveNode) -> int | None:
@@ -72,6 +72,14 @@ class TaskRunner:
         tick = self._ticks.get(live)
         return None if tick is None else tick.release_ns
 
+    def computes(self, live: LiveNode) -> bool:
+        """Return whether the tick in progress has the loop at this moment.
+
+        Thread: any.
+        """
+        tick = self._ticks.get(live)
+        return tick is not None and computes(tick.task)
+
     def stack(self, live: LiveNode) -> Stack:
         """Return where the tick in progress waits; without one, where the loop is.
 
@@ -79,7 +87,7 @@ class TaskRunner:
         """
         tick = self._ticks.get(live)
         thread_id = self._bridge.thread_id
-        if tick is None or not live.ticking:
+        if tick is None or not live.busy:
             return stack_of_thread(thread_id)
         return stack_of_task(tick.task, thread_id)
 
@@ -148,6 +156,10 @@ class AsyncIoExecutor(LoopExecutor):
         """Return the release that waits for the loop."""
         started_ns = self._tasks.due_ns(live)
         return super().due_ns(live, now_ns) if started_ns is None else started_ns
+
+    def computes(self, live: LiveNode) -> bool:
+        """Return whether the node's task has the loop at this moment."""
+        return self._tasks.computes(live)
 
     def stack(self, live: LiveNode) -> Stack:
         """Return where the node's task waits."""

@@ -37,6 +37,10 @@ class LoopExecutor:
         """Return the release that waits for the loop."""
         return self._cycle.due_ns(live, now_ns)
 
+    def computes(self, live: LiveNode) -> bool:
+        """Return False: there are no async ticks."""
+        return False
+
     def stack(self, live: LiveNode) -> Stack:
         """Return where the loop's thread is."""
         return stack_of_thread(self._bridge.thread_id)

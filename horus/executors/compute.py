@@ -10,6 +10,7 @@ import functools
 
 from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
+from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
 from horus.loop.realtime import RealTime
 from horus.tick_path import build_tick
@@ -36,9 +37,10 @@ class ComputeThread(NodeThread):
 class ComputeExecutor(ThreadExecutor[ComputeThread]):
     """Hands each release to the node's worker; one that finds it busy is skipped."""
 
-    def __init__(self, cycle: Cycle, real_time: RealTime) -> None:
+    def __init__(self, bridge: Bridge, cycle: Cycle, real_time: RealTime) -> None:
         """Serve the nodes of one run."""
         super().__init__()
+        self._bridge = bridge
         self._cycle = cycle
         self._real_time = real_time
 
@@ -60,6 +62,13 @@ class ComputeExecutor(ThreadExecutor[ComputeThread]):
         """Return the release that waits for the worker, or for the loop to hand it on."""
         posted_ns = self.thread_of(live).posted_ns
         return self._cycle.due_ns(live, now_ns) if posted_ns is None else posted_ns
+
+    def thread_id(self, live: LiveNode) -> int | None:
+        """Return the worker's thread, or the loop's while that has nothing handed on."""
+        thread = self._threads.get(live)
+        if thread is not None and thread.posted_ns is None:
+            return self._bridge.thread_id
+        return super().thread_id(live)
 
     def retime(self, live: LiveNode) -> None:
         """Move the node to the grid of its new rate."""

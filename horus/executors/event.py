@@ -66,6 +66,10 @@ class EventExecutor:
         """Return the thread that runs the node's callbacks."""
         return self._home_of(live).thread_id(live)
 
+    def computes(self, live: LiveNode) -> bool:
+        """Return whether an async tick has the loop at this moment."""
+        return self._home_of(live).computes(live)
+
     def stack(self, live: LiveNode) -> Stack:
         """Return where the node's callbacks are."""
         return self._home_of(live).stack(live)
@@ -230,6 +234,10 @@ class LoopEventExecutor(LoopExecutor):
         """Return the arrival of the message whose tick has not begun."""
         runner = self._runners.get(live)
         return None if runner is None else runner.arrivals.due_ns()
+
+    def computes(self, live: LiveNode) -> bool:
+        """Return whether an async tick has the loop at this moment."""
+        return self._tasks.computes(live)
 
     def stack(self, live: LiveNode) -> Stack:
         """Return where the node's task waits, or where the loop is."""

@@ -123,6 +123,10 @@ class ThreadExecutor(ABC, Generic[T]):
         thread = self._threads.get(live)
         return None if thread is None else thread.ident
 
+    def computes(self, live: LiveNode) -> bool:
+        """Return False: there are no async ticks."""
+        return False
+
     def stack(self, live: LiveNode) -> Stack:
         """Return where the node's thread is."""
         return stack_of_thread(self.thread_id(live))

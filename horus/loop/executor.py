@@ -21,6 +21,9 @@ class Home(Protocol):
     def thread_id(self, live: LiveNode) -> int | None:
         """Return the thread that runs the node's callbacks; None while nobody does."""
 
+    def computes(self, live: LiveNode) -> bool:
+        """Return whether an async tick has the thread at this moment: it does not await."""
+
     def stack(self, live: LiveNode) -> Stack:
         """Return where the node's callbacks are, or what keeps them from their thread."""
 

@@ -68,6 +68,8 @@ class Inspector:
         if finding.critical and health is Health.HEALTHY:
             health = Health.WARNING
         news = health is not before or health is Health.HEALTHY
+        # First: isolation cuts async ticks short, and then they are nowhere.
+        stack = finding.home.stack(live)
         isolated = False
         if health is Health.ISOLATED:
             if not self._safety.isolate(live, finding.ticks):
@@ -83,7 +85,6 @@ class Inspector:
             )
             entered = self._safety.enter(reason, self._watchdog.watched())
         if news or entered:
-            stack = finding.home.stack(live)
             self._report(functools.partial(self._tell, finding, health, news, entered, stack))
 
     def _timeout_ns(self, live: LiveNode) -> int:

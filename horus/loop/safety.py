@@ -98,7 +98,7 @@ class Safety:
         for live in lives:
             if not live.held:
                 continue
-            if not live.hook_returned.is_set() or (live.health is Health.ISOLATED and live.ticking):
+            if not live.hook_returned.is_set() or (live.health is Health.ISOLATED and live.busy):
                 remain.append(live.name)
             else:
                 live.free()

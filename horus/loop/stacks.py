@@ -43,9 +43,9 @@ def stack_of_task(task: asyncio.Task[Any], thread_id: int | None) -> Stack:
 
     Thread: any other.
     """
-    coroutine: Any = task.get_coro()
-    if getattr(coroutine, "cr_running", False):
+    if computes(task):
         return stack_of_thread(thread_id)
+    coroutine: Any = task.get_coro()
     frames: list[tuple[FrameType, int]] = []
     while (frame := getattr(coroutine, "cr_frame", None)) is not None:
         frames.append((frame, frame.f_lineno))
@@ -64,6 +64,11 @@ def in_callback(frame: FrameType | None) -> bool:
     while caller is not None and not _is_ours(caller):
         caller = caller.f_back
     return caller is not None and caller.f_code.co_name in _CALLERS
+
+
+def computes(task: asyncio.Task[Any]) -> bool:
+    """Return whether a task executes at this moment. Thread: any."""
+    return bool(getattr(task.get_coro(), "cr_running", False))
 
 
 def readable_stack(stack: Stack) -> str:

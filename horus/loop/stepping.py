@@ -18,7 +18,7 @@ from horus.clock import Timeline
 from horus.live import EventTick, LiveNode
 from horus.loop.executor import Home
 from horus.loop.private_loop import StepLoop, StuckError
-from horus.loop.safety import Safety
+from horus.loop.safety import HOOK_TIMEOUT_S, Safety
 from horus.loop.stacks import Stack, stack_of_task, stack_of_thread
 from horus.spec import NodeState
 from horus.tick_path import RunTick, RunTickAsync, build_async_tick, build_tick
@@ -167,8 +167,10 @@ class Stepper:
             self.shut_down_one(live)
 
     def shut_down_one(self, live: LiveNode) -> None:
-        """Call `shutdown()` of a node, if it is initialised."""
+        """Call `shutdown()` of a node, if it is initialised, after its safe-state hook."""
         live.leave_service()
+        if not self.timeline.deterministic:
+            live.hook_returned.wait(HOOK_TIMEOUT_S)
         if live.claim_shutdown():
             self.run_phase(live, "shutdown")
             live.stopped()
@@ -186,6 +188,10 @@ class Stepper:
     def thread_id(self, live: LiveNode) -> int | None:
         """Return the thread that drives. Thread: any."""
         return self._driver
+
+    def computes(self, live: LiveNode) -> bool:
+        """Return False: nobody waits for the thread that drives."""
+        return False
 
     def stack(self, live: LiveNode) -> Stack:
         """Return where the tick in progress is. Thread: any other."""

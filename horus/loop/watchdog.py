@@ -93,15 +93,20 @@ class Watchdog:
         holders = {
             home.thread_id(live): live
             for live, home in members
-            if (live.ticking or live.reviving) and not live.is_async
+            if live.busy and (not live.is_async or home.computes(live))
         }
         findings = []
         for live, home in members:
             timeout_ns = self.timeout_of(live)
-            if timeout_ns and live.initialized and live.health is not Health.ISOLATED:
-                finding = self._look_at(live, home, timeout_ns, now_ns, late_ns, holders)
-                if finding is not None:
-                    findings.append(finding)
+            if not timeout_ns or not live.initialized:
+                continue
+            if live.health is Health.ISOLATED:
+                # It may be let go right after this look.
+                self._look_again_at(now_ns + timeout_ns)
+                continue
+            finding = self._look_at(live, home, timeout_ns, now_ns, late_ns, holders)
+            if finding is not None:
+                findings.append(finding)
         if len(self._vigils) > 2 * len(members):
             self._vigils = {live: self._vigils[live] for live, _ in members if live in self._vigils}
         return findings
@@ -115,11 +120,11 @@ class Watchdog:
         late_ns: int,
         holders: dict[int | None, LiveNode],
     ) -> Finding | None:
-        # The tick path writes the start before `ticking`, so we read them the other way round.
-        running = live.ticking
-        ticks = live.counters.ticks
+        ticks = live.counters.ticks  # first: if the tick ends from here on, it shows
+        busy_since_ns = live.busy_since_ns
+        running = busy_since_ns != NEVER
         since_ns = _begun_ns(live) if running else _due_ns(live, home, now_ns)
-        began_ns = live.tick_context.start_ns if running else since_ns
+        began_ns = busy_since_ns if running else since_ns
         critical_ns = live.critical_ns or FOREVER_NS
         vigil = self._vigils.setdefault(live, _Vigil())
         recovered = False
@@ -162,10 +167,12 @@ def _begun_ns(live: LiveNode) -> int:
     A message that waited behind another one was not owed before that one's tick began.
     """
     context = live.tick_context
-    return max(context.release_ns, context.previous_ns)
+    return max(context.release_ns, context.previous_ns, live.owed_from_ns)
 
 
 def _due_ns(live: LiveNode, home: Home, now_ns: int) -> int:
     """Return since when a tick is owed that has not begun [ns]; `NEVER` if none is."""
     due_ns = home.due_ns(live, now_ns)
-    return NEVER if due_ns is None else max(due_ns, live.tick_context.start_ns)
+    if due_ns is None:
+        return NEVER
+    return max(due_ns, live.tick_context.start_ns, live.owed_from_ns)
