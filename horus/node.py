@@ -80,14 +80,15 @@ class Node:
             priority: SCHED_FIFO priority of the node's thread, 1 to 99; with `rt=True`
                 derived from the rate when not given.
             core: CPU core to pin the node's thread to.
-            watchdog: Watchdog timeout [s] of this node, instead of the scheduler's.
-                Not in this version.
+            watchdog: Watchdog timeout [s] of this node, instead of the scheduler's
+                `watchdog_ms`: for ticks that do not end.
             pubs: Topics it sends: a name, a list of names, `Pub(...)`, message
                 classes (the topic is named after the class), or `{topic: type}`.
             subs: Topics it receives: likewise, with `Sub(topic, capacity=...)`.
             init: Called once before the first tick.
             shutdown: Called once at the end, on every path.
-            safe_state: Called to bring the node's hardware into a safe state.
+            safe_state: Called to bring the node's hardware into a safe state, within 0.1 s
+                and from whatever thread; a node that has it is held in a safe state.
             on_error: Called as `on_error(node, exception)` when a callback raises;
                 it is told, it does not decide.
 

@@ -1,6 +1,7 @@
 """Mark a node as safety-critical, with a timeout of its own.
 
-A release that does not supervise yet accepts the call and warns that it is not enforced.
+A tick of it that lasts longer than its timeout puts the whole system in its safe state. This one
+does not.
 
 Prints:
     motor_controller is critical: 500 ms

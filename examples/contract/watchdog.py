@@ -1,6 +1,7 @@
 """Configure the watchdog: one timeout for all nodes, a stricter one for the motor.
 
-A release that does not supervise yet accepts the configuration and warns that it is not enforced.
+A tick that lasts longer is reported while it lasts; after three timeouts its node is isolated.
+Ticks that end are none of the watchdog's business, so both nodes are healthy here.
 
 Prints:
     motor   healthy

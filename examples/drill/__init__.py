@@ -1,0 +1,1 @@
+"""The parts of the example `fault_drill.py`."""
