@@ -11,7 +11,7 @@ import pytest
 
 from horus import Node, Scheduler
 
-from .helpers import PATIENCE_S, TRIGGER, wait_until
+from .helpers import PATIENCE_S, TRIGGER, node_of, wait_until
 
 WAYS = (
     "BestEffort",
@@ -178,3 +178,49 @@ def expirations(sched: Scheduler, name: str = "frozen") -> int:
     """Return how often the watchdog has run out for a node."""
     count: int = sched.get_node_stats(name)["watchdog_expirations"]
     return count
+
+
+def in_safe_state(sched: Scheduler) -> bool:
+    """Return whether the whole system is in its safe state."""
+    active: bool = sched.safety_stats()["safe_state"]
+    return active
+
+
+class Witness:
+    """Nodes around a critical one: what their ticks, hooks and shutdowns do, in order."""
+
+    def __init__(self, sched: Scheduler) -> None:
+        """Watch over a scheduler."""
+        self.sched = sched
+        self.ticks: dict[str, int] = {}
+        self.journal: list[tuple[str, str]] = []
+        self.hook_threads: dict[str, int] = {}
+
+    def add(self, kind: str, name: str, *, hook: bool = True, **options: Any) -> None:
+        """Add a node that says what happens to it."""
+        self.ticks[name] = 0
+        if hook:
+            options["safe_state"] = self.hook
+        self.sched.add(node_of(kind, name, self.tick, rate=50, shutdown=self.shutdown, **options))
+
+    def tick(self, node: Node) -> None:
+        """Count a tick."""
+        self.ticks[node.name] += 1
+
+    def hook(self, node: Node) -> None:
+        """Take note of a safe-state hook, and of its thread."""
+        self.hook_threads[node.name] = threading.get_ident()
+        self.journal.append(("hook", node.name))
+
+    def shutdown(self, node: Node) -> None:
+        """Take note of a `shutdown()`."""
+        self.journal.append(("shutdown", node.name))
+
+    def names(self, what: str) -> list[str]:
+        """Return which nodes did something, in order."""
+        return [name for did, name in tuple(self.journal) if did == what]
+
+    def all_tick(self) -> bool:
+        """Return whether every node has ticked; what waits for messages gets one."""
+        self.sched.publish(TRIGGER, 1)
+        return all(self.ticks.values())

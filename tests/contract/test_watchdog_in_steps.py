@@ -149,6 +149,32 @@ def test_an_init_that_hangs_during_a_restart_is_watched_in_steps(make, is_async)
     assert expirations(sched) == 1
 
 
+def test_shutdown_after_a_step_waits_for_the_hook(make):
+    """A node that was just isolated is shut down after its hook, not during it."""
+    sched = make(watchdog_ms=50)
+    journal = []
+
+    def hook(node):
+        journal.append("hook")
+        time.sleep(50 * ms)
+        journal.append("hook ended")
+
+    sched.add(
+        Node(
+            "frozen",
+            lambda: time.sleep(0.18),
+            safe_state=hook,
+            shutdown=lambda: journal.append("shutdown"),
+        )
+    )
+    sched.tick_once()
+    assert sched.get_node_stats("frozen")["health"] == "isolated"
+    sched.stop()
+
+    wait_until(lambda: len(journal) == 3)
+    assert journal == ["hook", "hook ended", "shutdown"]
+
+
 def test_the_time_between_two_steps_is_not_measured(make):
     """A step that is not taken is not owed: a test may think between two tick_once()."""
     sched = make(tick_rate=1000, watchdog_ms=50)

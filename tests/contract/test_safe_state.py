@@ -1,0 +1,233 @@
+"""The system-wide safe state: what happens when a critical node freezes."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+
+import pytest
+
+from horus import Node, ms
+
+from .freezing import (
+    MARKER,
+    ON_LOOP,
+    WAYS,
+    Freezer,
+    Witness,
+    await_health,
+    freezing_node,
+    in_safe_state,
+    reports,
+)
+from .helpers import TRIGGER, as_async, nothing, running, wait_until
+
+pytestmark = pytest.mark.realtime
+
+TIMEOUT_MS = 100
+
+
+# -- entering --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_critical_node_that_freezes_puts_the_whole_system_in_its_safe_state(make, way, caplog):
+    """A critical node that exceeds its timeout: enter_safe_state() is called on all nodes."""
+    sched = make()
+    witness, freezer = Witness(sched), Freezer(armed=False)
+    witness.add("Rt", "motor", order=10)
+    witness.add("Compute", "planner", order=30)
+    witness.add("Rt", "reporter", order=40, hook=False)
+    sched.add(freezing_node(way, freezer, "critical", order=20))
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    with running(sched), freezer:
+        wait_until(lambda: witness.all_tick())
+        freezer.freeze()
+        sched.publish(TRIGGER, 1)
+        wait_until(lambda: in_safe_state(sched))
+        wait_until(lambda: len(witness.names("hook")) == 2 and freezer.hook_threads)
+
+        # In shutdown order: the last to run is the first to be made safe.
+        assert witness.names("hook") == ["planner", "motor"]
+        assert len(freezer.hook_threads) == 1
+        assert "critical" in sched.safety_stats()["safe_state_reason"]
+        wait_until(lambda: [r for r in caplog.records if r.levelname == "CRITICAL"])
+        (record,) = [r for r in caplog.records if r.levelname == "CRITICAL"]
+        assert "safe state entered: critical node critical" in record.getMessage()
+        wait_until(lambda: reports(caplog, "critical"))
+        assert MARKER in reports(caplog, "critical")[0][2]
+
+
+def test_nodes_with_a_hook_are_held_and_nodes_without_tick_on(make, loop):
+    """Nodes that have a hook do not tick until clear_safe_state(); others keep reporting."""
+    sched = make(loop=loop)
+    witness, freezer = Witness(sched), Freezer(armed=False)
+    kinds = ("BestEffort", "Event", "AsyncIo", "Rt", "Compute")
+    for kind in kinds:
+        witness.add(kind, f"{kind}_held")
+        witness.add(kind, f"{kind}_free", hook=False)
+    sched.add(freezing_node("Rt", freezer, "critical", order=0))
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    with running(sched), freezer:
+        wait_until(lambda: witness.all_tick())
+        freezer.freeze()
+        wait_until(lambda: len(witness.names("hook")) == 5)
+        # A tick that was under way when the gate was closed has ended by now.
+        before = {info["name"]: info for info in sched.get_all_nodes()}
+        ticks = dict(witness.ticks)
+
+        def goes_on(name: str) -> bool:
+            sched.publish(TRIGGER, 1)
+            if name.endswith("_free"):
+                return witness.ticks[name] >= ticks[name] + 3
+            return sched.get_node_stats(name)["skipped"] >= before[name]["skipped"] + 3
+
+        for name in witness.ticks:
+            wait_until(lambda name=name: goes_on(name))
+        for kind in kinds:
+            assert witness.ticks[f"{kind}_held"] == ticks[f"{kind}_held"]
+            assert sched.get_node_stats(f"{kind}_held")["state"] == "safe_state"
+            assert sched.get_node_stats(f"{kind}_held")["health"] == "healthy"
+            assert sched.get_node_stats(f"{kind}_free")["state"] == "running"
+        assert sorted(witness.names("hook")) == sorted(f"{kind}_held" for kind in kinds)
+
+
+def test_the_timeout_of_a_critical_node_is_its_own(make):
+    """This is stricter than the global watchdog: 100 ms for the motor, a minute for others."""
+    sched = make(watchdog_ms=60_000)
+    critical, other = Freezer(), Freezer()
+    sched.add(freezing_node("Compute", other, "other"))
+    sched.add(freezing_node("Rt", critical, "critical"))
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    with running(sched), critical, other:
+        wait_until(lambda: in_safe_state(sched))
+        wait_until(lambda: critical.hook_threads and other.hook_threads)
+
+        assert sched.get_node_stats("critical")["health"] == "warning"
+        assert sched.get_node_stats("other")["health"] == "healthy"
+        assert sched.safety_stats()["watchdog_expirations"] == 1
+
+
+def test_an_ordinary_node_that_freezes_is_isolated_alone(make):
+    """A regular node that freezes gets isolated; only a critical one concerns the system."""
+    sched = make(watchdog_ms=TIMEOUT_MS)
+    witness, freezer = Witness(sched), Freezer()
+    witness.add("Rt", "motor")
+    sched.add(freezing_node("Compute", freezer))
+    with running(sched), freezer:
+        await_health(sched, "frozen", "isolated")
+        wait_until(lambda: freezer.hook_threads)
+        before = witness.ticks["motor"]
+        wait_until(lambda: witness.ticks["motor"] >= before + 3)
+
+        assert not in_safe_state(sched)
+        assert sched.safety_stats()["safe_state_reason"] is None
+        assert witness.names("hook") == []
+
+
+def test_a_critical_node_is_critical_even_if_another_one_has_its_thread(make):
+    """Its motor is not controlled: a critical node that cannot begin counts all the same."""
+    sched = make(watchdog_ms=60_000)
+    witness, blocker = Witness(sched), Freezer(armed=False)
+    sched.add(freezing_node("BestEffort", blocker, "blocker", order=0))
+    witness.add("BestEffort", "critical", order=1)
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    with running(sched), blocker:
+        wait_until(lambda: witness.all_tick())
+        blocker.freeze()
+        wait_until(lambda: witness.names("hook") == ["critical"])
+
+        assert "because of blocker" in sched.safety_stats()["safe_state_reason"]
+
+
+def test_a_critical_node_that_keeps_its_timeout_changes_nothing(make):
+    """Idle or busy, a critical node that is in time leaves the system alone."""
+    sched = make()
+    witness = Witness(sched)
+    witness.add("Rt", "motor")
+    sched.add(Node("slow", lambda: time.sleep(20 * ms), rate=10))
+    sched.add(Node("rare", nothing, rate=1))
+    sched.add(Node("silent", nothing, on="silence"))
+    for name in ("motor", "slow", "rare", "silent"):
+        sched.add_critical_node(name, timeout_ms=2 * TIMEOUT_MS)
+    with running(sched):
+        wait_until(lambda: sched.get_node_stats("slow")["total_ticks"] >= 8)
+
+    assert sched.safety_stats()["watchdog_expirations"] == 0
+    assert witness.names("hook") == []
+
+
+# -- hooks that misbehave --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["Rt", "AsyncIo"])
+def test_a_hook_that_raises_or_hangs_does_not_stop_the_others(make, kind, caplog):
+    """Each hook is bounded in time and contained; one that hangs is named with its stack."""
+    sched = make()
+    witness, freezer, stuck = Witness(sched), Freezer(armed=False), Freezer()
+    thawed = threading.Event()
+
+    def fail(node):
+        raise OSError("brake is stuck")
+
+    async def hang_async(node):
+        while not thawed.is_set():  # noqa: ASYNC110
+            await asyncio.sleep(0.002)
+
+    def hang(node):
+        stuck.stuck_in_the_driver()
+
+    witness.add("Rt", "last", order=10)
+    raising = as_async(nothing) if kind == "AsyncIo" else nothing
+    hanging = hang_async if kind == "AsyncIo" else hang
+    failing = as_async(fail) if kind == "AsyncIo" else fail
+    sched.add(Node("hangs", raising, rate=50, order=30, safe_state=hanging))
+    sched.add(Node("raises", raising, rate=50, order=20, safe_state=failing))
+    sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False))
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    with running(sched), freezer, stuck:
+        try:
+            wait_until(lambda: witness.all_tick())
+            freezer.freeze()
+            wait_until(lambda: witness.names("hook") == ["last"])
+            assert sched.get_node_stats("raises")["errors_count"] == 1
+            wait_until(lambda: any("has not returned" in r.getMessage() for r in caplog.records))
+            assert any("brake is stuck" in r.getMessage() for r in caplog.records)
+            freezer.thaw()
+            wait_until(lambda: sched.get_node_stats("critical")["health"] == "healthy")
+            # Nobody must tick against its own hook.
+            assert sched.clear_safe_state() == ["hangs"]
+            assert sched.get_node_stats("hangs")["state"] == "safe_state"
+        finally:
+            thawed.set()
+            stuck.thaw()
+        wait_until(lambda: sched.clear_safe_state() == [])
+        wait_until(lambda: sched.get_node_stats("hangs")["state"] == "running")
+
+
+@pytest.mark.parametrize("way", ["Rt", *ON_LOOP])
+def test_async_hooks_run_on_the_loop_when_it_is_free_and_elsewhere_when_it_is_blocked(make, way):
+    """The hook of an async node has its loop if it can have it, and is called in any case."""
+    sched = make()
+    witness, freezer = Witness(sched), Freezer(armed=False)
+    loop_threads = []
+
+    async def tick(node):
+        loop_threads.append(threading.get_ident())
+
+    async def hook(node):
+        await asyncio.sleep(0.001)
+        witness.hook(node)
+
+    sched.add(Node("uploader", tick, rate=50, order=10, safe_state=hook))
+    sched.add(freezing_node(way, freezer, "critical", order=0))
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    with running(sched), freezer:
+        wait_until(lambda: loop_threads)
+        freezer.freeze()
+        sched.publish(TRIGGER, 1)
+        wait_until(lambda: witness.names("hook") == ["uploader"])
+
+        on_loop = witness.hook_threads["uploader"] == loop_threads[0]
+        assert on_loop == (way not in ON_LOOP)
