@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import pytest
 
-from horus import Node, Scheduler
+from horus import Node, Scheduler, StateError
 
 from .helpers import PATIENCE_S, TRIGGER, node_of, wait_until
 
@@ -178,6 +178,17 @@ def expirations(sched: Scheduler, name: str = "frozen") -> int:
     """Return how often the watchdog has run out for a node."""
     count: int = sched.get_node_stats(name)["watchdog_expirations"]
     return count
+
+
+def cleared(sched: Scheduler) -> bool:
+    """Clear the safe state; return whether that was possible, and nobody remains held.
+
+    A tick that has just ended counts as frozen until it has been settled.
+    """
+    try:
+        return sched.clear_safe_state() == []
+    except StateError:
+        return False
 
 
 def in_safe_state(sched: Scheduler) -> bool:

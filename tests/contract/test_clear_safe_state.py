@@ -16,6 +16,7 @@ from .freezing import (
     Freezer,
     Witness,
     await_health,
+    cleared,
     expirations,
     freezing_node,
     in_safe_state,
@@ -51,7 +52,7 @@ def test_clear_safe_state_lets_the_nodes_tick_again(make, way):
         await_health(sched, "critical", "healthy")
         assert in_safe_state(sched)
         held_at, ended = witness.ticks["motor"], freezer.ended
-        assert sched.clear_safe_state() == []
+        wait_until(lambda: cleared(sched))
         assert not in_safe_state(sched)
         assert sched.safety_stats()["safe_state_reason"] is None
         sched.publish(TRIGGER, 2)
@@ -77,7 +78,7 @@ def test_an_isolated_node_ticks_again_once_its_tick_has_returned(make, way):
             assert sched.clear_safe_state() == ["frozen"]
             assert sched.get_node_stats("frozen")["state"] == "safe_state"
         freezer.thaw()
-        wait_until(lambda: sched.clear_safe_state() == [])
+        wait_until(lambda: cleared(sched))
         ended = freezer.ended
         sched.publish(TRIGGER, 2)
         wait_until(lambda: freezer.ended > ended)
@@ -115,7 +116,7 @@ def test_the_safe_state_can_be_entered_again(make):
             wait_until(lambda episode=episode: len(witness.names("hook")) == episode)
             freezer.thaw()
             await_health(sched, "critical", "healthy")
-            assert sched.clear_safe_state() == []
+            wait_until(lambda: cleared(sched))
 
 
 @pytest.mark.parametrize("way", [*ON_LOOP, "Rt"])
@@ -149,7 +150,7 @@ def test_the_same_while_the_system_is_in_its_safe_state(make):
         await_health(sched, "other", "warning")
         critical.thaw()
         await_health(sched, "critical", "healthy")
-        assert sched.clear_safe_state() == []
+        wait_until(lambda: cleared(sched))
         await_health(sched, "other", "unhealthy")
 
         assert expirations(sched, "other") == 1
@@ -176,7 +177,7 @@ def test_a_node_that_is_added_in_the_safe_state_is_held(make, kind):
         assert sched.get_node_stats("late")["state"] == "safe_state"
         freezer.thaw()
         await_health(sched, "critical", "healthy")
-        assert sched.clear_safe_state() == []
+        wait_until(lambda: cleared(sched))
         wait_until(lambda: witness.ticks["late"] >= 1)
 
 
@@ -273,7 +274,7 @@ def test_the_safe_state_in_an_application(make, loop):
             sched.clear_safe_state()
         freezer.thaw()
         await until(lambda: sched.get_node_stats("critical")["health"] == "healthy")
-        assert sched.clear_safe_state() == []
+        await until(lambda: cleared(sched))
         held_at = dict(witness.ticks)
         await until(lambda: all(witness.ticks[name] > held_at[name] for name in held_at))
         sched.stop()
@@ -336,6 +337,6 @@ def test_clearing_waits_for_hooks_that_were_just_called(make):
         wait_until(lambda: in_safe_state(sched))
         freezer.thaw()
         await_health(sched, "critical", "healthy")
-        assert sched.clear_safe_state() == []
+        wait_until(lambda: cleared(sched))
         ended = journal.index("hook ended")
         wait_until(lambda: "tick" in journal[ended:])

@@ -15,6 +15,7 @@ from .freezing import (
     MARKER,
     Freezer,
     await_health,
+    cleared,
     expirations,
     freezing_node,
     reports,
@@ -240,7 +241,7 @@ def test_a_node_that_was_let_go_is_watched_again(make):
         time.sleep(3 * TIMEOUT_MS * ms)
         freezer.thaw()
         wait_until(lambda: freezer.ended == 1)
-        wait_until(lambda: sched.clear_safe_state() == [])
+        wait_until(lambda: cleared(sched))
         wait_until(lambda: freezer.ended >= 2)
         freezer.freeze()
         await_health(sched, "frozen", "isolated")
