@@ -180,15 +180,20 @@ def expirations(sched: Scheduler, name: str = "frozen") -> int:
     return count
 
 
-def cleared(sched: Scheduler) -> bool:
-    """Clear the safe state; return whether that was possible, and nobody remains held.
+def remaining(sched: Scheduler) -> list[str] | None:
+    """Clear the safe state; return who remains held, or None if that is not possible yet.
 
     A tick that has just ended counts as frozen until it has been settled.
     """
     try:
-        return sched.clear_safe_state() == []
+        return sched.clear_safe_state()
     except StateError:
-        return False
+        return None
+
+
+def cleared(sched: Scheduler) -> bool:
+    """Clear the safe state; return whether nobody remains held."""
+    return remaining(sched) == []
 
 
 def in_safe_state(sched: Scheduler) -> bool:
