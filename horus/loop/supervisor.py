@@ -28,6 +28,7 @@ from horus.units import to_s
 _log = logging.getLogger("horus.supervisor")
 
 _SHORTEST_SLEEP_S = 0.001
+_PAUSE_AFTER_FAILURE_S = 0.1
 _SECONDS_PER_FULL_COLLECTION = 60
 
 
@@ -119,6 +120,9 @@ class Supervisor:
             except Exception as exc:
                 # Supervision goes on whatever happens to it.
                 self.report(functools.partial(_log.error, "an inspection failed", exc_info=exc))
+                # It may not have come to the point of saying when to look again.
+                await asyncio.sleep(_PAUSE_AFTER_FAILURE_S)
+                continue
             if self._inspector.next_ns == FOREVER_NS:
                 await self._changed.wait()
                 continue
