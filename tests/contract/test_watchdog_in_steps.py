@@ -10,6 +10,7 @@ import time
 import pytest
 
 from horus import Node, ms
+from horus.executors.rt import RtExecutor
 
 from .freezing import (
     MARKER,
@@ -228,6 +229,28 @@ def test_a_log_handler_that_blocks_does_not_block_supervision(make):
     finally:
         handler.unblocked.set()
         log.removeHandler(handler)
+
+
+def test_an_inspection_that_fails_is_not_the_last_one(make, monkeypatch, caplog):
+    """Supervision goes on whatever happens to it: an error of our own is logged, and survived."""
+    failures = []
+    due_ns = RtExecutor.due_ns
+
+    def fail_once(self, live, now_ns):
+        if not failures:
+            failures.append(1)
+            raise KeyError(live.name)
+        return due_ns(self, live, now_ns)
+
+    monkeypatch.setattr(RtExecutor, "due_ns", fail_once)
+    sched = make(watchdog_ms=TIMEOUT_MS)
+    freezer = Freezer(armed=False)
+    sched.add(freezing_node("Rt", freezer))
+    with running(sched), freezer:
+        wait_until(lambda: failures and freezer.ended)
+        freezer.freeze()
+        await_health(sched, "frozen", "isolated")
+        wait_until(lambda: any("inspection failed" in r.getMessage() for r in caplog.records))
 
 
 def test_a_node_that_was_let_go_is_watched_again(make):
