@@ -87,7 +87,6 @@ def test_skip_drops_a_release_and_warn_does_not(drill: tuple[dict[str, Any], Pat
         assert _observed_ms(one, "ticks again") > period_ms
 
 
-@pytest.mark.xfail(reason="a compute node is blamed for a loop that another node blocks")
 def test_a_blocked_event_loop_is_blamed_on_who_blocks_it(tmp_path: Path) -> None:
     """The camera freezes on the event loop: it is isolated, and no other node is reported."""
     done = _run("--class", "best_effort", "--fault", "freeze", "--json", cwd=tmp_path)
