@@ -34,7 +34,7 @@ def drill(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Pat
     """Run some drills; return their JSON, and where the picture is."""
     folder = tmp_path_factory.mktemp("drill")
     picture = folder / "fault_drill.png"
-    options = ["--class", "rt", "--class", "best_effort", "--class", "async"]
+    options = ["--class", "rt", "--class", "urgent", "--class", "async"]
     done = _run(*options, "--json", "--plot", str(picture), cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return json.loads(done.stdout), picture
@@ -63,7 +63,7 @@ def test_a_frozen_tick_goes_through_the_stages_in_order(
 ) -> None:
     """Warning, unhealthy, isolated: at one, two and three timeouts, with the place named."""
     drills = _drills(drill[0], "freeze", "isolated")
-    assert {d["node"] for d in drills} == {"motor", "camera", "cloud"}
+    assert {d["node"] for d in drills} == {"motor", "estop", "cloud"}
     for one in drills:
         stages = [_observed_ms(one, what) for what in ("warning", "unhealthy", "isolated")]
         assert stages == sorted(stages)
@@ -83,8 +83,18 @@ def test_a_critical_node_brings_down_the_whole_robot(drill: tuple[dict[str, Any]
 def test_skip_drops_a_release_and_warn_does_not(drill: tuple[dict[str, Any], Path]) -> None:
     """After an overrun, `on_miss="skip"` leaves a release out."""
     for one in _drills(drill[0], "overrun", "skip"):
-        period_ms = {"motor": 20, "camera": 33, "cloud": 50}[one["node"]]
+        period_ms = {"motor": 20, "estop": 50, "cloud": 50}[one["node"]]
         assert _observed_ms(one, "ticks again") > period_ms
+
+
+def test_a_blocked_event_loop_is_blamed_on_who_blocks_it(tmp_path: Path) -> None:
+    """The camera freezes on the event loop: it is isolated, and no other node is reported."""
+    done = _run("--class", "best_effort", "--fault", "freeze", "--json", cwd=tmp_path)
+    checks = {
+        c["what"]: c["passed"] for d in json.loads(done.stdout)["drills"] for c in d["checks"]
+    }
+    assert checks.pop("nobody else blamed")
+    assert all(checks.values())
 
 
 def test_the_picture_is_drawn(drill: tuple[dict[str, Any], Path]) -> None:
