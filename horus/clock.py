@@ -162,6 +162,7 @@ class TickContext:
     __slots__ = (
         "budget_ns",
         "counters",
+        "finish_ns",
         "fixed_dt_s",
         "node",
         "nominal_dt_s",
@@ -184,6 +185,7 @@ class TickContext:
         self.previous_ns = NEVER
         self.release_ns = 0
         self.start_ns = NEVER
+        self.finish_ns = NEVER
         self.ticking = False
         self.random: tuple[int, random.Random] | None = None
 

@@ -109,8 +109,10 @@ class LiveNode:
         """Whether the end of the next tick deserves a closer look."""
         self.critical_ns: int | None = None
         """How long a tick of a critical node may take [ns]; None for other nodes."""
+        self.holds = 0
+        """How often the node has been held."""
         self.hook_returned = threading.Event()
-        """Whether no safe-state hook is owed or in progress since the node was held."""
+        """Whether no safe-state hook is owed or in progress."""
         self.hook_returned.set()
         self.revival_ns = clock.NEVER
         """Since when `init()` runs again in place of a tick [ns]; `NEVER` while it does not."""
@@ -274,7 +276,8 @@ class LiveNode:
             self.skip_next = self.in_episode = self.held = self.alert = False
             self.hook_returned.set()
             self.health = Health.HEALTHY
-            self.tick_context.start_ns = self.tick_context.previous_ns = clock.NEVER
+            context = self.tick_context
+            context.start_ns = context.previous_ns = context.finish_ns = clock.NEVER
 
     def claim_shutdown(self) -> bool:
         """Return whether `shutdown()` is owed; the caller who hears yes must call it.
@@ -473,8 +476,30 @@ class LiveNode:
         # `held` first: whoever opens the gate looks at it afterwards.
         self.held = True
         self.gated = True
-        if self.has_hook:
+        self.holds += 1
+
+    def claim_hook(self) -> bool:
+        """Return whether there is a safe-state hook to call; who hears yes must call it.
+
+        And say when it has returned, with `hook_returned` or `safe_state_entered`.
+        Meanwhile nobody else does.
+
+        Thread: any.
+        """
+        with self._claims:
+            if not (self.has_hook and self.hook_returned.is_set()):
+                return False
             self.hook_returned.clear()
+        return True
+
+    def safe_state_entered(self) -> None:
+        """Take note that the hook has returned that a tick has led to: the tick is over.
+
+        Thread: the node's.
+        """
+        self.hook_returned.set()
+        self.tick_context.finish_ns = self.timeline.now_ns()
+        self.tick_context.ticking = False
 
     def free(self) -> None:
         """Let the node tick again, not isolated any more.

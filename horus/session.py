@@ -275,7 +275,7 @@ class Session:
         self._hooks.call(
             live
             for live in reversed(self.registry.in_order)
-            if live.state in alive and live.has_hook and live.hold()
+            if live.state in alive and live.hold() and live.claim_hook()
         )
 
     def _become_idle(self) -> None:

@@ -61,6 +61,7 @@ def build_tick(live: LiveNode) -> RunTick:
             error = exc
         if finish(release_ns, start_ns, limits, error):
             live.run_phase("safe_state")
+            live.safe_state_entered()
         # The exception's traceback refers to this frame: let go of it, or each
         # failed tick leaves a cycle to the garbage collector.
         error = None
@@ -102,7 +103,10 @@ def build_async_tick(live: LiveNode) -> RunTickAsync:
                 raise
             error = exc
         if finish(release_ns, start_ns, limits, error):
-            await live.run_phase_async("safe_state")
+            try:
+                await live.run_phase_async("safe_state")
+            finally:
+                live.safe_state_entered()
         error = None
 
     return run_tick
@@ -116,7 +120,7 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException |
     add_times = counters.times.add
 
     def finish(release_ns: int, start_ns: int, limits: Limits, error: BaseException | None) -> bool:
-        finish_ns = now_ns()
+        context.finish_ns = finish_ns = now_ns()
         execution_ns = finish_ns - start_ns
         counters.ticks += 1
         if counters.first_release_ns is None:
@@ -126,9 +130,7 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException |
         over_budget_ns = execution_ns - limits[0]
         past_deadline_ns = finish_ns - release_ns - limits[1]
         if over_budget_ns > 0 or past_deadline_ns > 0 or error is not None or live.alert:
-            enter_safe_state = _settle(live, limits, over_budget_ns, past_deadline_ns, error)
-            context.ticking = False
-            return enter_safe_state
+            return _settle(live, limits, over_budget_ns, past_deadline_ns, error)
         context.ticking = False
         return False
 
@@ -142,8 +144,13 @@ def _settle(
     past_deadline_ns: int,
     error: BaseException | None,
 ) -> bool:
-    """Count what went wrong, decide what follows and do it; see `_build_finish`."""
+    """Count what went wrong, decide what follows and do it; see `_build_finish`.
+
+    If the safe-state hook follows, the tick is not over before that has returned.
+    """
+    context = live.tick_context
     if live.abandoned:
+        context.ticking = False
         return False  # it was shut down without us: nothing may follow
     counters = live.counters
     outcome = Outcome(max(0, over_budget_ns), max(0, past_deadline_ns), error is not None)
@@ -154,12 +161,6 @@ def _settle(
         in_episode=live.in_episode,
     )
     live.in_episode = live.alert = outcome.missed
-    if live.health is not Health.HEALTHY and live.recovered():
-        live.reports.emit(logging.INFO, "healthy again")
-    if live.health is Health.ISOLATED:
-        live.reports.emit(
-            logging.WARNING, "its frozen tick has ended; clear_safe_state() lets it tick again"
-        )
     if error is not None:
         live.tick_failed(error)
     if outcome.over_budget_ns:
@@ -168,8 +169,21 @@ def _settle(
         counters.deadline_misses += 1
         live.control.count_miss()
     _act(live, limits, outcome, action, error)
-    # Held: the supervisor has called the hook already.
-    return action.enter_safe_state and not live.held
+    # Not if the supervisor has called the hook, or is about to.
+    enter_safe_state = action.enter_safe_state and not live.held and live.claim_hook()
+    context.ticking = enter_safe_state
+    if live.health is not Health.HEALTHY:
+        _tell_that_it_ended(live)
+    return enter_safe_state
+
+
+def _tell_that_it_ended(live: LiveNode) -> None:
+    if live.recovered():
+        live.reports.emit(logging.INFO, "healthy again")
+    elif live.health is Health.ISOLATED:
+        live.reports.emit(
+            logging.WARNING, "its frozen tick has ended; clear_safe_state() lets it tick again"
+        )
 
 
 def _act(

@@ -19,6 +19,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
+import platformdirs
+
 from horus.units import NS_PER_S, readable, to_s
 
 _log = logging.getLogger("horus.supervisor")
@@ -104,7 +106,5 @@ class FaultLog:
 
 def _directory() -> Path:
     """Return where such files go: `$HORUS_HOME`, or the user's directory for logs."""
-    import platformdirs  # 10 ms that most programs need not spend
-
     home = os.environ.get("HORUS_HOME")
     return Path(home) if home else platformdirs.user_log_path("horus", appauthor=False)

@@ -92,7 +92,8 @@ class Inspector:
 
     def _limit_of(self, finding: Finding) -> str:
         timeout_ns, critical_ns = self._timeout_ns(finding.live), finding.live.critical_ns
-        if finding.critical and critical_ns is not None and critical_ns < timeout_ns:
+        only_critical = finding.lasted_ns <= timeout_ns
+        if critical_ns is not None and finding.critical and only_critical:
             return f"its limit as a critical node is {readable(critical_ns)}"
         return f"its watchdog timeout is {readable(timeout_ns)}"
 

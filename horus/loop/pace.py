@@ -34,6 +34,8 @@ class _Window:
     ticks: int
     skipped: int
     execution_ns: int
+    interruptions: int
+    """How often the node was held, frozen or restarted: then it is not its pace."""
 
 
 class Pace:
@@ -56,11 +58,17 @@ class Pace:
         slow = []
         for live in self._members():
             counters = live.counters
+            if not _is_asked_to_tick(live):
+                continue
             present = _Window(
-                now_ns, counters.ticks, counters.skipped, counters.times.execution_total_ns
+                now_ns,
+                counters.ticks,
+                counters.skipped,
+                counters.times.execution_total_ns,
+                live.holds + counters.watchdog_expirations + counters.restarts,
             )
             window = before.get(live)
-            if window is None or not _is_asked_to_tick(live):
+            if window is None or window.interruptions != present.interruptions:
                 self._windows[live] = present
                 continue
             ran = present.ticks - window.ticks

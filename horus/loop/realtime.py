@@ -21,7 +21,7 @@ from horus.spec import SchedulerSpec
 
 _log = logging.getLogger("horus.scheduler")
 
-_SUPERVISOR_PRIORITY, _HOOK_PRIORITY = 95, 90
+_SUPERVISOR_PRIORITY, _HOOK_PRIORITY = 99, 98
 _LOWEST_PRIORITY, _HIGHEST_PRIORITY = 50, 89
 _TIMER_SLACK_NS = 1
 _NOT_LOCKED = (

@@ -101,6 +101,8 @@ class Runtime:
         try:
             with contextlib.ExitStack() as while_playing:
                 await self._initialize(members())
+                # Time for the watch to get ready: collecting garbage takes a while.
+                self._supervisor.look_again()
                 while_playing.enter_context(self._real_time.in_process())
                 if any(live.spec.execution_class is ExecutionClass.RT for live in self._homes):
                     while_playing.enter_context(prompt_switching())

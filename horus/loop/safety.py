@@ -66,10 +66,10 @@ class Safety:
             live: The node.
             ticks: Its count of ticks when it was found frozen.
         """
-        owed = not live.held and live.has_hook
+        held_already = live.held
         if not live.isolate(ticks):
             return False
-        if owed:
+        if not held_already and live.claim_hook():
             self._call_hooks([live])
         return True
 
@@ -111,5 +111,6 @@ class Safety:
 
     def _hold(self, lives: Iterable[LiveNode]) -> None:
         held = [live for live in lives if live.has_hook and live.initialized and live.hold()]
-        if held:
-            self._call_hooks(held)
+        owed = [live for live in held if live.claim_hook()]
+        if owed:
+            self._call_hooks(owed)

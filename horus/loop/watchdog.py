@@ -131,8 +131,9 @@ class Watchdog:
         if began_ns != vigil.began_ns:
             self._vigils[live] = vigil = _Vigil(began_ns)
             recovered = live.recovered()
-        elif late_ns > timeout_ns // 4:
-            vigil.unwatched_ns += late_ns
+        if late_ns > timeout_ns // 4 and began_ns != NEVER:
+            # A tick that is new to us may have begun at any time since we were to look.
+            vigil.unwatched_ns += min(late_ns, now_ns - began_ns)
         if began_ns == NEVER:
             # A tick that begins right after this look.
             self._look_again_at(now_ns + min(timeout_ns, critical_ns))
@@ -164,10 +165,13 @@ class Watchdog:
 def _begun_ns(live: LiveNode) -> int:
     """Return since when the tick in progress was owed [ns].
 
-    A message that waited behind another one was not owed before that one's tick began.
+    A message that waited behind another one was not owed before that one's tick ended.
     """
     context = live.tick_context
-    return max(context.release_ns, context.previous_ns, live.owed_from_ns)
+    finish_ns = context.finish_ns
+    if finish_ns > context.start_ns:
+        finish_ns = context.previous_ns  # it is in its safe-state hook
+    return max(context.release_ns, finish_ns, live.owed_from_ns)
 
 
 def _due_ns(live: LiveNode, home: Home, now_ns: int) -> int:
@@ -175,4 +179,4 @@ def _due_ns(live: LiveNode, home: Home, now_ns: int) -> int:
     due_ns = home.due_ns(live, now_ns)
     if due_ns is None:
         return NEVER
-    return max(due_ns, live.tick_context.start_ns, live.owed_from_ns)
+    return max(due_ns, live.tick_context.finish_ns, live.owed_from_ns)
