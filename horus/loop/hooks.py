@@ -16,7 +16,7 @@ from horus.spec import Health
 _LAST_TICK_MS = 20
 """How long a hook waits for the end of a healthy tick in progress [ms]."""
 
-_LOOP_TIMEOUT_S = 0.05
+_LOOP_TIMEOUT_S = 0.02
 """How long the event loop may take to begin an async hook [s]."""
 
 Report = Callable[[Callable[[], None]], None]

@@ -80,8 +80,9 @@ class Inspector:
             live.expire(health)
         entered = False
         if live.critical_ns is not None and (finding.critical or isolated):
-            reason = f"critical node {live.name} {_lasting(finding)}, longer than " + readable(
-                live.critical_ns if finding.critical else 3 * self._timeout_ns(live)
+            reason = (
+                f"critical node {live.name} {_lasting(finding)}, longer than its limit of "
+                + readable(live.critical_ns if finding.critical else 3 * self._timeout_ns(live))
             )
             entered = self._safety.enter(reason, self._watchdog.watched())
         if news or entered:
