@@ -83,7 +83,11 @@ class Ending:
         while not self._over:
             answered = asyncio.Event()
             self._bridge.post(lambda answered=answered: self._supervisor.call(answered.set))  # type: ignore[misc]
-            if not await _within(self._patience_s, answered):
+            if not await _within(self._patience_s, answered) and not await _within(
+                # Once more: a process that was suspended has had no chance.
+                _INTERRUPT_AGAIN_S,
+                answered,
+            ):
                 self._stop()
                 self._report()
                 if self._way_out is not None:
