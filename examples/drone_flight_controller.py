@@ -337,7 +337,7 @@ def parser() -> argparse.ArgumentParser:
     add("--esc-on-miss", choices=[miss.value for miss in Miss], help="for a late ESC tick")
     add("--esc-deadline-us", type=float, help="from release to end of an ESC tick")
     add("--max-deadline-misses", type=int, help="stop after so many, of all nodes together")
-    add("--watchdog-ms", type=int, default=0, help="detect ticks that do not end")
+    add("--watchdog-ms", type=int, default=100, help="detect ticks that do not end; 0 for never")
     add("--blackbox-mb", type=int, default=0, help="size of the flight recorder")
     add("--stall-at", type=float, default=math.inf, help="delay one ESC tick at this time [s]")
     return result

@@ -236,15 +236,19 @@ def drive_mission(*, deterministic: bool, duration_s: float) -> Run:
     """Build the vehicle, run it until it has arrived, and judge what happened."""
     world, grid = World(), OccupancyGrid()
     log = mission.MissionLog(clock=lambda: world.snapshot.time_s)
+    options = {"tick_rate": 1000, "watchdog_ms": 500, "name": "warehouse_agv"}
     with (
         FleetServer() as server,
-        Scheduler(tick_rate=1000, deterministic=deterministic, name="warehouse_agv") as sched,
+        Scheduler(deterministic=deterministic, **options) as sched,
     ):
         sched.add(SafetyMonitor(log))
         sched.add(LidarNode("front", 10, world, log)).add(LidarNode("rear", 11, world, log))
         sched.add(CameraNode(world, log)).add(PathPlanner(grid, log))
         sched.add(MotorController(world, log))
         sched.add(BatteryWatcher()).add(FleetUploader(server.url, log))
+        # If one of these freezes, the whole vehicle enters its safe state.
+        sched.add_critical_node("motor", timeout_ms=200)
+        sched.add_critical_node("safety", timeout_ms=100)
         sched.run(duration=duration_s)
         timing, stop_reason = str(sched.timing_report()), sched.stop_reason
     return Run(
