@@ -102,7 +102,7 @@ class Watchdog:
                 continue
             if live.health is Health.ISOLATED:
                 # It may be let go right after this look.
-                self._look_again_at(now_ns + timeout_ns)
+                self._look_again_at(now_ns + min(timeout_ns, live.critical_ns or FOREVER_NS))
                 continue
             finding = self._look_at(live, home, timeout_ns, now_ns, late_ns, holders)
             if finding is not None:
@@ -150,8 +150,8 @@ class Watchdog:
         self._look_again_at(counted_from_ns + (stages + 1) * timeout_ns + 1)
         lasted_ns = now_ns - since_ns
         critical = lasted_ns > critical_ns
-        if not critical:
-            self._look_again_at(since_ns + critical_ns + 1)
+        # Another tick may begin right after this look.
+        self._look_again_at((now_ns if critical else since_ns) + critical_ns + 1)
         worse = stages > GRADES.index(live.health)
         if not (worse or critical or recovered):
             return None
