@@ -59,7 +59,7 @@ class Watchdog:
       blame. A critical node counts all the same: its motor is not controlled.
     - When `look` itself comes late by a quarter of a timeout or more, because the
       process was suspended or something held the interpreter, that time is not
-      counted. For a critical node it is.
+      counted, and the tick has half a timeout more to end. For a critical node it is.
     - A tick that ends makes a node healthy again, unless it is isolated.
 
     Thread: one; `require` any.
@@ -133,7 +133,9 @@ class Watchdog:
             recovered = live.recovered()
         if late_ns > timeout_ns // 4 and began_ns != NEVER:
             # A tick that is new to us may have begun at any time since we were to look.
-            vigil.unwatched_ns += min(late_ns, now_ns - began_ns)
+            # And nobody knows since when we were not there: once, there is time to end.
+            grace_ns = 0 if vigil.unwatched_ns else timeout_ns // 2
+            vigil.unwatched_ns += max(0, min(late_ns, now_ns - began_ns)) + grace_ns
         if began_ns == NEVER:
             # A tick that begins right after this look.
             self._look_again_at(now_ns + min(timeout_ns, critical_ns))
