@@ -131,11 +131,12 @@ class Watchdog:
         if began_ns != vigil.began_ns:
             self._vigils[live] = vigil = _Vigil(began_ns)
             recovered = live.recovered()
-        if late_ns > timeout_ns // 4 and began_ns != NEVER:
-            # A tick that is new to us may have begun at any time since we were to look.
+        # A tick that is new to us may have begun at any time since we were to look.
+        unseen_ns = min(late_ns, now_ns - began_ns)
+        if unseen_ns > 0 and late_ns > timeout_ns // 4 and began_ns != NEVER:
             # And nobody knows since when we were not there: once, there is time to end.
             grace_ns = 0 if vigil.unwatched_ns else timeout_ns // 2
-            vigil.unwatched_ns += max(0, min(late_ns, now_ns - began_ns)) + grace_ns
+            vigil.unwatched_ns += unseen_ns + grace_ns
         if began_ns == NEVER:
             # A tick that begins right after this look.
             self._look_again_at(now_ns + min(timeout_ns, critical_ns))
