@@ -52,6 +52,37 @@ def test_no_rate_is_taken_for_a_freeze(timeout, rate_hz, fraction, ticks):
     assert world.live.counters.ticks == ticks
 
 
+@given(st.lists(st.integers(0, TIMEOUT), max_size=20))
+def test_messages_are_owed_one_after_another(ticks):
+    """A backlog is no frozen tick: each message counts from the end of the tick before it."""
+    world = World(TIMEOUT, critical_ns=TIMEOUT)
+    arrived_ns = world.clock.now_ns()
+    for length in ticks:
+        world.due_since_ns = arrived_ns
+        world.look()
+        world.tick(length, release_ns=arrived_ns)
+
+    assert world.expirations == 0
+    assert not world.safety.active
+
+
+@given(st.integers(0, 20 * TIMEOUT), st.integers(0, TIMEOUT))
+def test_a_message_that_waits_for_a_restart_is_owed_from_then_on(waited, length):
+    """The back-off of a restart, 100 ms here, is held against nobody, nor is what came before."""
+    world = World(TIMEOUT, critical_ns=TIMEOUT)
+    arrived_ns = world.clock.now_ns()
+    world.idle(waited)
+    world.live.plan_restart()
+    world.idle(100 * MS)
+    world.due_since_ns = arrived_ns
+    world.look()
+    world.tick(length, release_ns=arrived_ns)
+
+    assert world.live.counters.restarts == 1
+    assert world.expirations == 0
+    assert not world.safety.active
+
+
 # -- frozen nodes ----------------------------------------------------------------------------------
 
 
@@ -140,7 +171,7 @@ def test_a_suspended_process_is_not_a_frozen_tick(length, suspended, pause):
     world = World(TIMEOUT)
     world.idle(pause)
     # One that is just as long as the timeout cannot be told from a freeze.
-    world.tick(length, suspended_for_ns=TIMEOUT + TIMEOUT // 4 + suspended)
+    world.tick(length, suspended_for_ns=TIMEOUT + TIMEOUT // 4 + 1 + suspended)
 
     assert world.expirations == 0
     assert world.health is Health.HEALTHY

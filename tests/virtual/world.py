@@ -61,15 +61,17 @@ class World:
         """How often the watchdog has run out."""
         return self.live.counters.watchdog_expirations
 
-    def tick(self, lasts_ns: int, *, suspended_for_ns: int = 0) -> bool:
-        """Release the node for a tick of this length; return whether it has ticked.
+    def tick(
+        self, lasts_ns: int, *, suspended_for_ns: int = 0, release_ns: int | None = None
+    ) -> bool:
+        """Run a tick of this length, released now or earlier; return whether it has begun.
 
         In the middle of it, the whole process may be suspended, in addition.
         """
         begun = self.begun
         self._ends_at_ns = self.clock.now_ns() + lasts_ns
         self._suspended_for_ns = suspended_for_ns
-        self._run_tick(self.clock.now_ns())
+        self._run_tick(self.clock.now_ns() if release_ns is None else release_ns)
         return self.begun > begun
 
     def idle(self, for_ns: int) -> None:
@@ -92,6 +94,7 @@ class World:
         self.begun += 1
         middle_ns = (self.clock.now_ns() + self._ends_at_ns) // 2
         self._pass_until(middle_ns)
+        self.look()  # as it does at any time, when something has changed elsewhere
         self.suspend(self._suspended_for_ns)
         self._pass_until(self._ends_at_ns + self._suspended_for_ns)
 
