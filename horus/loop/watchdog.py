@@ -59,7 +59,7 @@ class Watchdog:
       blame. A critical node counts all the same: its motor is not controlled.
     - When `look` itself comes late by a quarter of a timeout or more, because the
       process was suspended or something held the interpreter, that time is not
-      counted. For a critical node it is.
+      counted, and the tick has half a timeout more to end. For a critical node it is.
     - A tick that ends makes a node healthy again, unless it is isolated.
 
     Thread: one; `require` any.
@@ -102,7 +102,7 @@ class Watchdog:
                 continue
             if live.health is Health.ISOLATED:
                 # It may be let go right after this look.
-                self._look_again_at(now_ns + timeout_ns)
+                self._look_again_at(now_ns + min(timeout_ns, live.critical_ns or FOREVER_NS))
                 continue
             finding = self._look_at(live, home, timeout_ns, now_ns, late_ns, holders)
             if finding is not None:
@@ -131,9 +131,12 @@ class Watchdog:
         if began_ns != vigil.began_ns:
             self._vigils[live] = vigil = _Vigil(began_ns)
             recovered = live.recovered()
-        if late_ns > timeout_ns // 4 and began_ns != NEVER:
-            # A tick that is new to us may have begun at any time since we were to look.
-            vigil.unwatched_ns += min(late_ns, now_ns - began_ns)
+        # A tick that is new to us may have begun at any time since we were to look.
+        unseen_ns = min(late_ns, now_ns - began_ns)
+        if unseen_ns > 0 and late_ns > timeout_ns // 4 and began_ns != NEVER:
+            # And nobody knows since when we were not there: once, there is time to end.
+            grace_ns = 0 if vigil.unwatched_ns else timeout_ns // 2
+            vigil.unwatched_ns += unseen_ns + grace_ns
         if began_ns == NEVER:
             # A tick that begins right after this look.
             self._look_again_at(now_ns + min(timeout_ns, critical_ns))
@@ -150,8 +153,8 @@ class Watchdog:
         self._look_again_at(counted_from_ns + (stages + 1) * timeout_ns + 1)
         lasted_ns = now_ns - since_ns
         critical = lasted_ns > critical_ns
-        if not critical:
-            self._look_again_at(since_ns + critical_ns + 1)
+        # Another tick may begin right after this look.
+        self._look_again_at((now_ns if critical else since_ns) + critical_ns + 1)
         worse = stages > GRADES.index(live.health)
         if not (worse or critical or recovered):
             return None

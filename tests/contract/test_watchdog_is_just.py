@@ -19,7 +19,7 @@ from .freezing import (
     freezing_node,
     reports,
 )
-from .helpers import TRIGGER, as_async, node_of, nothing, running, wait_until
+from .helpers import TRIGGER, as_async, node_of, nothing, run_program, running, wait_until
 
 pytestmark = pytest.mark.realtime
 
@@ -198,6 +198,35 @@ def test_the_other_nodes_tick_on_beside_a_frozen_one(make, way):
 
         assert min(meanwhile.values()) >= 2
         assert {kind: expirations(sched, kind) for kind in ticks} == dict.fromkeys(ticks, 0)
+
+
+def test_a_process_that_was_suspended_has_no_frozen_nodes():
+    """Ctrl+Z, a debugger or a paused virtual machine stops the watchdog, too: nobody is blamed."""
+    done = run_program(
+        """
+        import os, subprocess
+        from horus import Node, Scheduler
+
+        def nothing(node): pass
+        async def nothing_async(node): pass
+
+        sched = Scheduler(watchdog_ms=100)
+        sched.add(Node("best_effort", nothing))
+        sched.add(Node("async", nothing_async, rate=100))
+        sched.add(Node("compute", nothing, rate=100, compute=True))
+        sched.add(Node("event", nothing, on="go"))
+        sched.add(Node("urgent", nothing, on="go", deadline=30.0))
+        sched.add(Node("rt", lambda node: node.send("go", 1), rate=100))
+        me = os.getpid()
+        stop_and_go = f"sleep 0.2; kill -STOP {me}; sleep 0.8; kill -CONT {me}"
+        stopper = subprocess.Popen(["sh", "-c", stop_and_go])
+        while stopper.poll() is None:
+            sched.tick_for(0.3)
+        sched.stop()
+        print(sched.safety_stats()["watchdog_expirations"], sched.safety_stats()["skipped"] > 0)
+        """
+    )
+    assert done.stdout == "0 True\n", done.stderr
 
 
 # -- other callbacks -------------------------------------------------------------------------------

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from horus import FailurePolicy, Miss
-from horus.escalation import Action, Outcome, decide
+from horus import FailurePolicy, Health, Miss
+from horus.escalation import GRADES, Action, Outcome, decide, grade
 
 outcomes = st.builds(Outcome, st.integers(0, 10**9), st.integers(0, 10**9), st.booleans())
 policies = st.sampled_from(Miss)
@@ -83,3 +83,38 @@ def test_deciding_is_pure(
     }
     assert decide(outcome, **arguments) == decide(outcome, **arguments)
     assert outcome == before
+
+
+@pytest.mark.parametrize(
+    ("lasted_ns", "expected"),
+    [
+        (-5, Health.HEALTHY),
+        (0, Health.HEALTHY),
+        (100, Health.HEALTHY),
+        (101, Health.WARNING),
+        (200, Health.WARNING),
+        (201, Health.UNHEALTHY),
+        (300, Health.UNHEALTHY),
+        (301, Health.ISOLATED),
+        (10**18, Health.ISOLATED),
+    ],
+)
+def test_the_watchdog_s_table(lasted_ns: int, expected: Health) -> None:
+    """More than 1x the timeout: Warning; more than 2x: Unhealthy; more than 3x: Isolated."""
+    assert grade(lasted_ns, 100) is expected
+
+
+@given(st.integers(1, 10**12), st.integers(0, 10**13), st.integers(0, 10**13))
+def test_health_never_improves_while_a_tick_lasts(timeout_ns: int, lasted: int, more: int) -> None:
+    """The longer a tick lasts, the worse: stages are passed one after another."""
+    before, after = grade(lasted, timeout_ns), grade(lasted + more, timeout_ns)
+    assert GRADES.index(before) <= GRADES.index(after)
+    assert (before is Health.HEALTHY) == (lasted <= timeout_ns)
+
+
+@given(st.integers(1, 10**6), st.integers(0, 10**7), st.integers(1, 10**3))
+def test_stages_are_multiples_of_the_timeout_whatever_its_unit(
+    timeout_ns: int, lasted_ns: int, scale: int
+) -> None:
+    """Grading looks at the ratio alone."""
+    assert grade(lasted_ns * scale, timeout_ns * scale) is grade(lasted_ns, timeout_ns)
