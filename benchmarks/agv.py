@@ -11,9 +11,10 @@ import importlib.util
 import json
 import math
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from benchmarks import agv_report, cyclictest, harness, peers
 from benchmarks.agv_report import CYCLICTEST
@@ -21,10 +22,8 @@ from benchmarks.agv_workloads.scenario import MARGIN_S, MODES, REACTIONS, SOAK, 
 from benchmarks.harness import ChildRun, Contender
 from benchmarks.micro import OURS
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
 CHILDREN = Path(__file__).resolve().with_name("agv_workloads")
+WORKLOADS = (*MODES, *REACTIONS)
 START_AND_END_S = 90.0
 """How long a child may take beyond what it measures [s]."""
 THREADS, UVLOOP = "plain threads", "asyncio on uvloop"
@@ -46,12 +45,11 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help=f"measure {peers.HORUS_ROBOTICS.requirement} and {peers.DORA.requirement}, in "
         "environments made in .bench/, plain threads, and asyncio tasks on uvloop, too",
     )
+    count = harness.at_least_one
     parser.add_argument(
         "--seconds", type=_positive, default=5.0, metavar="N", help="length of a run, default 5"
     )
-    parser.add_argument(
-        "--rounds", type=harness.at_least_one, default=3, metavar="N", help="default 3"
-    )
+    parser.add_argument("--rounds", type=count, default=3, metavar="N", help="default 3")
     parser.add_argument(
         "--calm",
         type=float,
@@ -59,6 +57,25 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar="PERCENT",
         help="repeat runs during which other processes used more than this of all CPUs",
     )
+    _add_outputs(parser)
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=WORKLOADS,
+        default=WORKLOADS,
+        metavar="WORKLOAD",
+        help=f"run only these: {', '.join(WORKLOADS)}",
+    )
+    parser.add_argument(
+        "--soak",
+        type=_positive,
+        metavar="MINUTES",
+        help="instead of everything else, run a healthy schedule under a watchdog for so long",
+    )
+    return parser.parse_args(argv)
+
+
+def _add_outputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--markdown", action="store_true", help="print the tables as Markdown")
     parser.add_argument(
         "--json", type=harness.output_file, metavar="FILE", help="write all raw samples"
@@ -69,24 +86,6 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar="FILE",
         help="draw the latency histograms, e.g. agv.bench.png",
     )
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        choices=(*MODES, *REACTIONS),
-        default=(*MODES, *REACTIONS),
-        metavar="WORKLOAD",
-        help=f"run only these: {', '.join((*MODES, *REACTIONS))}",
-    )
-    parser.add_argument(
-        "--soak",
-        type=_positive,
-        metavar="MINUTES",
-        help="instead of everything else, run a healthy schedule under a watchdog for so long",
-    )
-    options = parser.parse_args(argv)
-    if options.plot is not None and importlib.util.find_spec("matplotlib") is None:
-        parser.error("--plot: matplotlib is not installed (pip install -e '.[examples]')")
-    return options
 
 
 def _positive(text: str) -> float:
@@ -157,22 +156,28 @@ def report(
     *,
     markdown: bool,
 ) -> str:
-    """Return the printed result: facts, a table per mode, targets, reactions, how to read it."""
+    """Return the printed result: facts, a table per mode, reactions, targets, how to read it."""
     render = harness.render_markdown if markdown else harness.render_text
     ran = {run.workload for run in runs}
     sections = [("  \n" if markdown else "\n").join(head_lines(runs, facts))]
     for mode in MODES:
         if mode in ran:
             labels = dict.fromkeys(run.contender for run in runs if run.workload == mode)
-            rows = agv_report.agv_rows(runs, mode, [*labels, *missing], missing)
+            rows = agv_report.agv_rows(runs, mode, [*labels, *missing])
             sections.append(render(rows))
     if not ran.isdisjoint(MODES):
-        sections += [render(agv_report.target_rows(runs)), "\n".join(NOTES)]
+        sections.append("\n".join(NOTES))
     measures = [each for each in agv_report.REACTION_MEASURES if each.workload in ran]
     if measures:
-        sections.append(render(harness.table_rows(runs, measures, [OURS])))
+        # Their targets are in the next table.
+        _, *rows = (row[:3] for row in harness.table_rows(runs, measures, [OURS]))
+        sections.append(render([("reaction", "unit", OURS), *rows]))
+    sections.append(render(agv_report.target_rows(runs)))
     rounds = max((run.round for run in runs), default=0)
-    ending = [f"Figures are medians over {rounds} round{'s' if rounds != 1 else ''}."]
+    ending = [
+        f"Figures are medians over {rounds} round{'s' if rounds != 1 else ''}"
+        f"{' (lowest-highest round); max and longest are the worst of all' if rounds > 1 else ''}."
+    ]
     ending += [f"{label}: {why}" for label, why in missing.items()]
     sections.append("\n".join([*ending, *harness.failures(runs)]))
     return "\n\n".join(sections)
@@ -180,10 +185,11 @@ def report(
 
 def head_lines(runs: Sequence[ChildRun], facts: Mapping[str, str]) -> list[str]:
     """Return facts about machine and contenders, and what the system refused them."""
-    refused = {run.contender: run.package.get("refused by the system") for run in runs}
+    key = "refused by the system"
+    refused = {run.contender: run.package[key] for run in runs if key in run.package}
     return [
         *harness.describe(runs, facts),
-        *(f"{label}: {what} refused by the system" for label, what in refused.items() if what),
+        *(f"{key} to {label}: {what}" for label, what in refused.items()),
     ]
 
 
@@ -198,12 +204,11 @@ def document(
             entry["figures"] = asdict(agv_report.motor_figures(run.series))
         entries.append(entry)
     targets = []
-    for line in agv_report.TARGETS:
-        figure = agv_report.target_figure(runs, line)
-        known = not math.isnan(figure.median)
+    for verdict in agv_report.verdicts(runs):
+        figure = asdict(verdict.figure)
         # JSON has no word for a figure that was not measured, but null.
-        reached = {**asdict(figure), "met": line.target.met(figure.median)} if known else None
-        targets.append({**asdict(line), "reached": reached})
+        figure = {key: value if math.isfinite(value) else None for key, value in figure.items()}
+        targets.append({**asdict(verdict), "figure": figure, "met": verdict.met})
     return {
         "facts": facts,
         "seconds": seconds,
@@ -235,6 +240,9 @@ def _progress(line: str) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark and return 0 if every workload of this package delivered samples."""
     options = parse(argv)
+    if options.plot is not None and importlib.util.find_spec("matplotlib") is None:
+        _progress("without --plot: matplotlib is not installed (pip install -e '.[examples]')")
+        options.plot = None
     facts = harness.machine_facts()
     if options.soak is not None:
         return soak(options, facts)

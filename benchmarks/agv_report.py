@@ -1,4 +1,4 @@
-"""What the samples of the AGV benchmark mean: figures per run, medians over rounds, targets.
+"""What the samples of the AGV benchmark mean: figures per run and over rounds, targets.
 
 Nothing in here runs anything or reads a clock.
 """
@@ -8,12 +8,12 @@ from __future__ import annotations
 import bisect
 import math
 import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 from benchmarks import harness
-from benchmarks.agv_workloads.scenario import MODES, SOAK, WATCHDOG_TIMEOUTS_MS
+from benchmarks.agv_workloads.scenario import CRITICAL_CLASSES, CRITICAL_TIMEOUT_MS, MODES, SOAK
 from benchmarks.harness import (
     ChildRun,
     Figure,
@@ -25,10 +25,7 @@ from benchmarks.harness import (
 )
 from benchmarks.micro import OURS
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    Series = Mapping[str, Sequence[float]]
+Series = Mapping[str, Sequence[float]]
 
 CYCLICTEST = "cyclictest"
 
@@ -55,8 +52,6 @@ class MotorFigures:
     longest_gap_ms: float | None = None
     order_violations: float | None = None
     """Motor ticks per 5 s before which no safety tick had completed since the one before."""
-    own_order_violations: float | None = None
-    """What the scheduler itself counted, over the whole run and warm-up."""
 
 
 def window(series: Series) -> slice:
@@ -93,8 +88,6 @@ def motor_figures(series: Series) -> MotorFigures:
         figures |= _interval_figures(series)
     if "safety_seen" in series:
         figures["order_violations"] = _per_5_s(count_violations(series), series)
-    if "own_order_violations" in series:
-        figures["own_order_violations"] = series["own_order_violations"][0]
     return MotorFigures(**figures)
 
 
@@ -148,6 +141,7 @@ class Column:
     """Name of a field of `MotorFigures`."""
     decimals: int | None = None
     """Fixed number of decimals; None for three significant digits."""
+    over_rounds: Callable[[Iterable[float]], float] = statistics.median
 
 
 COLUMNS = (
@@ -155,11 +149,11 @@ COLUMNS = (
     Column("latency p50 µs", "latency_p50_us"),
     Column("p99", "latency_p99_us"),
     Column("p99.9", "latency_p999_us"),
-    Column("max", "latency_max_us"),
+    Column("max", "latency_max_us", over_rounds=max),
     Column("interval error p99 µs", "interval_error_p99_us"),
     Column("gaps > 1.5 ms", "gaps_over_1_5_ms"),
     Column("> 2 ms", "gaps_over_2_ms"),
-    Column("longest ms", "longest_gap_ms"),
+    Column("longest ms", "longest_gap_ms", over_rounds=max),
     Column("order violations", "order_violations"),
 )
 
@@ -185,23 +179,20 @@ def figure_of(values: Mapping[int, float]) -> Figure:
 
 
 def agv_rows(
-    runs: Sequence[ChildRun], mode: str, contenders: Sequence[str], missing: Mapping[str, str]
+    runs: Sequence[ChildRun], mode: str, contenders: Sequence[str]
 ) -> list[tuple[str, ...]]:
-    """Return a table of all contenders in one mode, medians over rounds, header first.
+    """Return a table of all contenders in one mode, header first.
 
     Args:
         runs: All runs.
         mode: A key of ``MODES``.
-        contenders: Labels in the order of the rows.
-        missing: Contenders that could not be run at all, and what the table says of them.
+        contenders: Labels in the order of the rows; one without any run was not installed.
     """
     rows = [(MODES[mode].title, *(column.title for column in COLUMNS))]
     for contender in contenders:
-        ran = any(
-            (run.workload, run.contender) == (mode, contender) and run.error is None for run in runs
-        )
-        if not ran:
-            verdict = missing.get(contender, "failed")
+        errors = [run.error for run in runs if (run.workload, run.contender) == (mode, contender)]
+        if all(error is not None for error in errors):
+            verdict = "failed" if errors else "not installed"
             rows.append((contender, verdict, *("-" for _ in COLUMNS[1:])))
             continue
         cells = [
@@ -215,10 +206,10 @@ def agv_rows(
 def _cell(values: Mapping[int, float], column: Column) -> str:
     if not values:
         return "-"
-    median = statistics.median(values.values())
+    value = column.over_rounds(values.values())
     if column.decimals is not None:
-        return f"{median:.{column.decimals}f}"
-    return harness.format_number(median)
+        return f"{value:.{column.decimals}f}"
+    return harness.format_number(value)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,36 +274,85 @@ def target_figure(runs: Sequence[ChildRun], line: AgvTarget) -> Figure:
     return figure_of(ours)
 
 
-def target_rows(runs: Sequence[ChildRun]) -> list[tuple[str, ...]]:
-    """Return the table of targets, header first; only of modes that were run."""
-    rows = [("mode", "figure", "unit", OURS, "target", "met")]
-    for line in TARGETS:
-        if not any(run.workload == line.mode for run in runs):
-            continue
-        figure = target_figure(runs, line)
-        met = "yes" if line.target.met(figure.median) else "no"
-        measured = not math.isnan(figure.median)
-        if not measured and line.relative and figures_by_round(runs, line.mode, OURS, line.figure):
-            # Without cyclictest there is nothing to compare with, which is nobody's failure.
-            rows.append((MODES[line.mode].title, line.title, line.unit, "-", str(line.target), "-"))
-            continue
-        rows.append(
-            (MODES[line.mode].title, line.title, line.unit, str(figure), str(line.target), met)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What was measured of a target."""
+
+    title: str
+    unit: str
+    figure: Figure
+    target: Target
+    known: bool = True
+    """False if there was nothing to compare with, which is nobody's failure."""
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the target was met; None if that is not known."""
+        return self.target.met(self.figure.median) if self.known else None
+
+
+def verdicts(runs: Sequence[ChildRun]) -> list[Verdict]:
+    """Return what was measured of the targets of all workloads that were run."""
+    ran = {run.workload for run in runs}
+    limited = {run.workload for run in runs if run.contender == CYCLICTEST and run.error is None}
+    of_motor = [
+        Verdict(
+            title=f"{MODES[line.mode].title}: {line.title}",
+            unit=line.unit,
+            figure=target_figure(runs, line),
+            target=line.target,
+            known=line.mode in limited or not line.relative,
         )
-    return rows
+        for line in TARGETS
+        if line.mode in ran
+    ]
+    of_reactions = [
+        Verdict(
+            title=measure.title,
+            unit=measure.unit,
+            figure=harness.summarize(runs, measure, OURS),
+            target=measure.target,
+        )
+        for measure in REACTION_MEASURES
+        if measure.workload in ran and measure.target is not None
+    ]
+    return of_motor + of_reactions
 
 
-def watchdog_excess_ms(timeout_ms: int) -> harness.Statistic:
-    """Return the statistic: first warning after a tick froze, less the timeout [ms].
-
-    Infinite if the node came back without a warning.
-    """
-    name = f"reaction_{timeout_ms}_ms_ns"
-    return lambda run: run[name][0] / 1e6 - timeout_ms if run[name] else math.inf
+def target_rows(runs: Sequence[ChildRun]) -> list[tuple[str, ...]]:
+    """Return the table of targets, header first."""
+    words = {True: "met", False: "missed", None: "-"}
+    return [
+        ("target", "unit", OURS, "bound", "verdict"),
+        *(
+            (
+                verdict.title,
+                verdict.unit,
+                str(verdict.figure) if verdict.known else "-",
+                str(verdict.target),
+                words[verdict.met],
+            )
+            for verdict in verdicts(runs)
+        ),
+    ]
 
 
 def _in_us(statistic: harness.Statistic) -> harness.Statistic:
     return lambda run: statistic(run) / 1e3
+
+
+def excess_ms(key: str, percent: float) -> harness.Statistic:
+    """Return the statistic: a percentile of how long after its timeout the system was safe [ms].
+
+    A freeze that nobody reacted to while it lasted counts as an infinite one.
+    """
+
+    def statistic(run: Series) -> float:
+        reactions = [*run[f"{key}_ns"]]
+        reactions += [math.inf] * (int(run[f"{key}_freezes"][0]) - len(reactions))
+        return percentile(reactions, percent) / 1e6 - CRITICAL_TIMEOUT_MS
+
+    return statistic
 
 
 REACTION_MEASURES = (
@@ -350,13 +390,14 @@ REACTION_MEASURES = (
     ),
     *(
         Measure(
-            title=f"watchdog, first warning later than its {timeout_ms} ms by",
+            title=f"frozen {words}, safe state after its timeout, {name}",
             unit="ms",
             workload="watchdog",
-            statistic=watchdog_excess_ms(timeout_ms),
-            target=Target(bound=0.1 * timeout_ms + 5.0),
+            statistic=excess_ms(key, percent),
+            target=Target(bound=0.1 * CRITICAL_TIMEOUT_MS + 5.0) if name == "worst" else None,
         )
-        for timeout_ms in WATCHDOG_TIMEOUTS_MS
+        for key, words in CRITICAL_CLASSES.items()
+        for name, percent in (("median", 50.0), ("worst", 100.0))
     ),
 )
 

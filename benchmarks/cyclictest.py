@@ -1,7 +1,8 @@
 """The machine's own limit: Debian's cyclictest, a C program that does nothing but wake up.
 
 ``python cyclictest.py NAME --seconds N --out FILE`` runs it and writes its latencies as raw
-samples, like any other workload; the name only says which workload it runs beside.
+samples, like any other workload; the name only says which workload it runs beside. It also asks the
+kernel to keep the processor from sleeping (``/dev/cpu_dma_latency``), which none of the others do.
 """
 
 from __future__ import annotations

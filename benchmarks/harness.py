@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import datetime
 import json
 import math
 import os
 import platform
 import shutil
+import signal
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, NamedTuple, TypedDict
@@ -21,6 +23,7 @@ from typing import Literal, NamedTuple, TypedDict
 REPOSITORY = Path(__file__).resolve().parent.parent
 WORKLOADS = Path(__file__).resolve().with_name("workloads.py")
 SHARED_MEMORY = Path("/dev/shm")
+NAMESPACE = "HORUS_NAMESPACE"
 
 CALM_ATTEMPTS = 6
 """How often a workload is run at most to find the machine undisturbed."""
@@ -211,7 +214,7 @@ def _spawn(contender: Contender, workload: str, *, quick: bool, timeout_s: float
         # PYTHON* variables of the caller would bend the figures: without byte code files, say, an
         # import is mostly compilation.
         environment = {key: value for key, value in os.environ.items() if key[:6] != "PYTHON"}
-        environment["HORUS_NAMESPACE"] = namespace
+        environment[NAMESPACE] = namespace
         if contender.import_root is not None:
             environment["PYTHONPATH"] = str(contender.import_root)
         try:
@@ -231,6 +234,9 @@ def _spawn(contender: Contender, workload: str, *, quick: bool, timeout_s: float
         except OSError as error:
             raise ChildError(f"cannot start {contender.python}: {error}") from error
         finally:
+            # However this ends, be it by Ctrl-C: contenders start processes of their own, some in
+            # process groups of their own.
+            _end_all(namespace)
             shutil.rmtree(SHARED_MEMORY / f"horus_{namespace}", ignore_errors=True)
         if child.returncode != 0 or not out.exists():
             tail = " | ".join(child.stderr.strip().splitlines()[-3:])
@@ -241,6 +247,26 @@ def _spawn(contender: Contender, workload: str, *, quick: bool, timeout_s: float
     if root is not None and not imported.is_relative_to(root.resolve()):
         raise ChildError(f"measured {imported} instead of the package in {root}")
     return result
+
+
+def processes_of(namespace: str) -> Iterator[int]:
+    """Find what runs for a namespace, where the kernel tells the environments of processes."""
+    setting = f"{NAMESPACE}={namespace}".encode()
+    for environment in Path("/proc").glob("[0-9]*/environ"):
+        # Others end meanwhile, or are not ours to look at.
+        with contextlib.suppress(OSError):
+            if setting in environment.read_bytes().split(b"\0"):
+                yield int(environment.parent.name)
+
+
+def _end_all(namespace: str) -> None:
+    killed: set[int] = set()
+    while left := set(processes_of(namespace)) - killed:
+        for pid in left:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        # Again, for what those had started in the meantime.
+        killed |= left
 
 
 def run_rounds(

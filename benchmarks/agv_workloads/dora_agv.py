@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import signal
 import subprocess
 import sys
 from collections import deque
@@ -71,8 +70,6 @@ def run_node(name: str, mode: Mode, seconds: float, out: Path) -> None:
     import dora
 
     total_s = WARMUP_S + seconds + MARGIN_S
-    # Should dora leave us alone without ending our events, the kernel ends this process.
-    signal.alarm(int(total_s + START_AND_END_S))
     recorder = Recorder(total_s)
     tick = make_ticks(mode, recorder, make_motor(recorder), awaits=False)[name]
     events = dora.Node()
@@ -127,7 +124,7 @@ def run(mode: Mode, seconds: float) -> tuple[dict[str, str], dict[str, list[int]
     overlay = Path("zenoh.json5").absolute()
     overlay.write_text(json.dumps(ZENOH_OVERLAY), encoding="utf-8")
     limit_s = WARMUP_S + seconds + MARGIN_S + START_AND_END_S
-    child = subprocess.Popen(
+    child = subprocess.run(
         [
             Path(sys.executable).with_name("dora"),
             "run",
@@ -136,21 +133,14 @@ def run(mode: Mode, seconds: float) -> tuple[dict[str, str], dict[str, list[int]
             f"{limit_s:.0f}s",
         ],
         env={**os.environ, "DORA_ZENOH_CONFIG_OVERLAY": str(overlay)},
-        stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        start_new_session=True,
+        check=False,
     )
-    try:
-        said, _ = child.communicate(timeout=limit_s + 10.0)
-    except subprocess.TimeoutExpired:
-        # The group is the child's own: it was made with it.
-        os.killpg(child.pid, signal.SIGKILL)
-        said, _ = child.communicate()
     if child.returncode != 0 or not out.exists():
-        tail = " | ".join(said.strip().splitlines()[-3:])
+        tail = " | ".join(child.stdout.strip().splitlines()[-3:])
         raise RuntimeError(f"dora run ended with status {child.returncode}: {tail}")
     series: dict[str, list[int]] = json.loads(out.read_text(encoding="utf-8"))
     return {}, series

@@ -7,19 +7,20 @@ use what only this package has, such as the release of a tick.
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import random
 import time
+import warnings
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
 
 from horus_agv import make_nodes, release_teller
 from scenario import (
+    CRITICAL_CLASSES,
+    CRITICAL_TIMEOUT_MS,
     MARGIN_S,
     MODES,
     WARMUP_S,
-    WATCHDOG_TIMEOUTS_MS,
     Recorder,
     burn,
     make_motor,
@@ -30,9 +31,6 @@ from scenario import (
 import horus
 from horus import Node, Scheduler, ms
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 Series = dict[str, list[int]]
 
 STOP_TOPIC = "estop"
@@ -41,10 +39,12 @@ STOP_JITTER_S = 0.010
 """Longest delay of a message behind the tick's start [s]: half a period."""
 BLOCKING_S = 0.100
 
-FREEZE_TIMEOUTS = 5
-"""How many times its timeout a node freezes."""
+FREEZES_OF_A_KIND = 5
+FROZEN_RATE_HZ = 20.0
+HEALTHY_S, FREEZE_S = 0.2, 0.3
 
 SOAK_WATCHDOG_MS = 100
+OFTEN_HZ, SELDOM_HZ = 10.0, 0.2
 
 
 def baton(seconds: float) -> Series:
@@ -78,6 +78,8 @@ def baton(seconds: float) -> Series:
         # A motor that did not wait, or whose safety node skipped the release, took no baton.
         if opens_ns <= start < closes_ns and ended_ns.get(release, start) < start
     ]
+    if not hops:
+        raise RuntimeError(f"no baton was handed on; the motor ticked {recorder.count} times")
     return {"hop_ns": hops}
 
 
@@ -107,134 +109,119 @@ def estop(seconds: float) -> Series:
 
     scheduler = Scheduler(tick_rate=1000, rt=True)
     scheduler.add(Node(name="bumper", tick=watch, rate=STOP_RATE_HZ, order=0, pubs=[STOP_TOPIC]))
-    scheduler.add(
-        Node(
-            name="brake",
-            tick=handle,
-            on=STOP_TOPIC,
-            order=1,
-            priority=90,
-            deadline=1 * ms,
-            subs=[STOP_TOPIC],
-        )
-    )
+    urgent = {"priority": 90, "deadline": 1 * ms}
+    scheduler.add(Node(name="brake", tick=handle, on=STOP_TOPIC, order=1, **urgent))
     scheduler.add(Node(name="logger", tick=block, order=200))
     scheduler.run(duration=seconds)
+    if not latencies:
+        raise RuntimeError(f"no emergency stop was handled; {sent} were sent")
     return {"latency_ns": latencies, "sent": [sent]}
 
 
-class FirstWarning(logging.Handler):
-    """Notes when each log record at warning level or above was made."""
-
-    def __init__(self) -> None:
-        """Listen to everything from warnings on."""
-        super().__init__(logging.WARNING)
-        self.made_ns: list[int] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Note the time."""
-        self.made_ns.append(now_ns())
+def watched_scheduler(watchdog_ms: int) -> Scheduler:
+    """Return a scheduler with a watchdog, or raise: none at all never barks at healthy nodes."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="watchdog_ms")
+        return Scheduler(tick_rate=1000, rt=True, watchdog_ms=watchdog_ms)
 
 
-def freeze_once(timeout_ms: int) -> tuple[int | None, int]:
-    """Freeze a node once; return the time to the first warning [ns], and expirations counted.
+def busy_wait(seconds: float) -> None:
+    """Compute for so long [s], where a sleep would leave the interpreter to others."""
+    end_ns = now_ns() + int(seconds * 1e9)
+    while now_ns() < end_ns:
+        pass
 
-    Only a record made while the tick is frozen counts: what is said afterwards is of no help.
+
+def freeze_once(rate_hz: float | None, freeze: Callable[[float], None]) -> list[int]:
+    """Freeze a critical node; return how long after the tick's start all nodes were safe [ns].
+
+    That is when the last safe-state hook was entered: the node's own, and that of a motor at 1 kHz
+    beside it. A list without an item if that was not before the tick came back.
     """
-    freeze_s = FREEZE_TIMEOUTS * timeout_ms / 1e3
+    begins_ns = now_ns() + int(HEALTHY_S * 1e9)
     frozen_ns: list[int] = []
-    healthy_ticks = 0
+    hooks_ns: list[int] = []
 
     def tick(_node: Node) -> None:
-        nonlocal healthy_ticks
-        if frozen_ns or healthy_ticks < 10:
-            healthy_ticks += 1
-            return
-        frozen_ns.append(now_ns())
-        time.sleep(freeze_s)
-        frozen_ns.append(now_ns())
+        if not frozen_ns and now_ns() >= begins_ns:
+            frozen_ns.append(now_ns())
+            freeze(FREEZE_S)
+            frozen_ns.append(now_ns())
 
     def beat(_node: Node) -> None:
         """Stand for the rest of the robot."""
 
-    warnings = FirstWarning()
-    logger = logging.getLogger("horus.node.frozen")
-    logger.addHandler(warnings)
-    try:
-        scheduler = Scheduler(tick_rate=1000, rt=True, watchdog_ms=timeout_ms)
-        scheduler.add(Node(name="frozen", tick=tick, rate=20.0, order=10))
-        scheduler.add(Node(name="motor", tick=beat, rate=1000.0, order=70))
-        scheduler.run(duration=10 / 20.0 + freeze_s + 1.0)
-    finally:
-        logger.removeHandler(warnings)
+    def make_safe(_node: Node) -> None:
+        hooks_ns.append(now_ns())
+
+    scheduler = watched_scheduler(CRITICAL_TIMEOUT_MS)
+    scheduler.add(Node(name="frozen", tick=tick, rate=rate_hz, order=10, safe_state=make_safe))
+    scheduler.add(Node(name="motor", tick=beat, rate=1000.0, order=70, safe_state=make_safe))
+    scheduler.add_critical_node("frozen", timeout_ms=CRITICAL_TIMEOUT_MS)
+    scheduler.run(duration=HEALTHY_S + FREEZE_S + MARGIN_S)
+    if len(frozen_ns) < 2:
+        raise RuntimeError(f"the node did not freeze for {FREEZE_S} s, or never came back")
     start_ns, end_ns = frozen_ns
-    in_time = [made - start_ns for made in warnings.made_ns if start_ns <= made < end_ns]
-    expirations = scheduler.safety_stats()["watchdog_expirations"]
-    return (in_time[0] if in_time else None), expirations
+    safe = len(hooks_ns) == 2 and max(hooks_ns) < end_ns
+    return [max(hooks_ns) - start_ns] if safe else []
 
 
 def watchdog(_seconds: float) -> Series:
-    """Time from the start of a frozen tick to the first warning [ns], for each timeout.
+    """Time from the start of a critical node's frozen tick until all nodes are safe [ns].
 
-    A series is empty if the node came back without having been reported.
+    The tick blocks a thread of the node's own, or the event loop; it sleeps half of the times, and
+    computes in the others.
     """
     series: Series = {}
-    for timeout_ms in WATCHDOG_TIMEOUTS_MS:
-        reaction_ns, expirations = freeze_once(timeout_ms)
-        series[f"reaction_{timeout_ms}_ms_ns"] = [] if reaction_ns is None else [reaction_ns]
-        series[f"expirations_{timeout_ms}_ms"] = [expirations]
+    for key in CRITICAL_CLASSES:
+        rate_hz = FROZEN_RATE_HZ if key == "rt" else None
+        freezes = [time.sleep, busy_wait] * FREEZES_OF_A_KIND
+        series[f"{key}_freezes"] = [len(freezes)]
+        series[f"{key}_ns"] = [
+            reaction_ns for freeze in freezes for reaction_ns in freeze_once(rate_hz, freeze)
+        ]
     return series
 
 
 def soak_nodes(ticks: Counter[str]) -> list[tuple[Node, float]]:
     """Return healthy nodes of every class that count their ticks, each with its rate [Hz]."""
 
-    def count(node: Any) -> None:
+    def count(node: Node) -> None:
         ticks[node.name] += 1
 
-    def compute(node: Any) -> None:
+    def compute(node: Node) -> None:
         count(node)
         burn(0.010)
 
-    async def poll(node: Any) -> None:
+    async def poll(node: Node) -> None:
         count(node)
         await asyncio.sleep(0.020)
 
-    def sender(topic: str) -> Callable[[Any], None]:
-        def send(node: Any) -> None:
-            count(node)
-            node.send(topic, {"ok": True})
+    def send(node: Node) -> None:
+        count(node)
+        node.send(node.name, {"ok": True})
 
-        return send
+    def receive(node: Node) -> None:
+        count(node)
+        node.recv(f"rt_{node.name}")
 
-    def receiver(topic: str) -> Callable[[Any], None]:
-        def receive(node: Any) -> None:
-            count(node)
-            node.recv(topic)
-
-        return receive
-
-    often, seldom = 10.0, 0.2
-    timed: list[tuple[str, Callable[[Any], Any], float, dict[str, Any]]] = [
-        ("rt_1000_hz", count, 1000.0, {}),
-        ("rt_100_hz", count, 100.0, {}),
-        ("rt_10_hz", sender("report"), often, {}),
-        ("rt_0.2_hz", sender("alarm"), seldom, {}),
-        ("compute_10_hz", compute, often, {"compute": True}),
-        ("compute_0.2_hz", compute, seldom, {"compute": True}),
-        ("async_20_hz", poll, 20.0, {}),
-        ("async_0.2_hz", poll, seldom, {}),
+    nodes: list[tuple[Node, float]] = [
+        (Node(name=name, tick=tick, rate=rate_hz, compute=tick is compute), rate_hz)
+        for tick, rates_hz in (
+            (count, {"rt_motor": 1000.0, "rt_tracker": 100.0}),
+            (send, {"rt_event": OFTEN_HZ, "rt_urgent": SELDOM_HZ}),
+            (compute, {"compute_often": OFTEN_HZ, "compute_seldom": SELDOM_HZ}),
+            (poll, {"async_often": 20.0, "async_seldom": SELDOM_HZ}),
+        )
+        for name, rate_hz in rates_hz.items()
     ]
-    nodes = [
-        (Node(name=name, tick=tick, rate=rate_hz, order=order, **how), rate_hz)
-        for order, (name, tick, rate_hz, how) in enumerate(timed)
-    ]
-    nodes += [
+    # The last two are released by what the nodes named after them send.
+    return [
+        *nodes,
         (Node(name="best_effort", tick=count), 30.0),
-        (Node(name="event_10_hz", tick=receiver("report"), on="report"), often),
-        (Node(name="urgent_0.2_hz", tick=receiver("alarm"), on="alarm", priority=90), seldom),
+        (Node(name="event", tick=receive, on="rt_event"), OFTEN_HZ),
+        (Node(name="urgent", tick=receive, on="rt_urgent", priority=90), SELDOM_HZ),
     ]
-    return nodes
 
 
 def soak(seconds: float) -> Series:
@@ -244,12 +231,12 @@ def soak(seconds: float) -> Series:
     """
     ticks: Counter[str] = Counter()
     nodes = soak_nodes(ticks)
-    scheduler = Scheduler(tick_rate=1000, rt=True, watchdog_ms=SOAK_WATCHDOG_MS)
+    scheduler = watched_scheduler(SOAK_WATCHDOG_MS)
     for node, _ in nodes:
         scheduler.add(node)
     scheduler.run(duration=seconds)
     series = {
-        node.name: [ticks[node.name], math.ceil(round(rate_hz * seconds, 6))]
+        f"{node.name}, {rate_hz:g} Hz": [ticks[node.name], math.ceil(round(rate_hz * seconds, 6))]
         for node, rate_hz in nodes
     }
     series["watchdog_expirations"] = [scheduler.safety_stats()["watchdog_expirations"]]

@@ -217,7 +217,9 @@ MODES: Mapping[str, Mode] = {
 REACTIONS = ("baton", "estop", "watchdog")
 """Workloads of this package only, measured along with the modes: functions in ``reaction.py``."""
 SOAK = "soak"
-WATCHDOG_TIMEOUTS_MS = (50, 100, 500)
+CRITICAL_TIMEOUT_MS = 100
+CRITICAL_CLASSES: Mapping[str, str] = {"rt": "Rt node", "best_effort": "BestEffort node"}
+"""Which critical nodes freeze in the watchdog's workload, each with its name in the tables."""
 
 
 def make_ticks(mode: Mode, recorder: Recorder, motor: Tick, *, awaits: bool) -> dict[str, Tick]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -251,14 +253,18 @@ def test_a_contender_that_cannot_be_started_is_reported(tmp_path: Path) -> None:
     assert str(tmp_path) in run.error
 
 
-def test_a_child_that_hangs_is_ended(tmp_path: Path) -> None:
-    """The time limit ends the child and says so."""
+def test_a_child_that_hangs_is_ended_with_all_that_it_started(tmp_path: Path) -> None:
+    """The time limit ends the child, and another process in a group of its own, and says so."""
     (tmp_path / "horus").mkdir()
-    source = "import time\ntime.sleep(60)\n"
+    source = "import subprocess\nsubprocess.run(['sleep', '60'], process_group=0)\n"
     (tmp_path / "horus" / "__init__.py").write_text(source, encoding="utf-8")
     contender = Contender(label="stuck", python=Path(sys.executable), import_root=tmp_path)
-    run = harness.run_child(contender, "event", round_number=1, quick=True, timeout_s=0.5)
-    assert run.error == "no result within 0.5 s"
+    run = harness.run_child(contender, "event", round_number=1, quick=True, timeout_s=1.0)
+    assert run.error == "no result within 1 s"
+    until_s = time.monotonic() + 5.0
+    while list(harness.processes_of(f"bench{os.getpid()}")):
+        assert time.monotonic() < until_s
+        time.sleep(0.01)
 
 
 def test_a_quick_run_of_this_package_yields_every_figure_of_its_workload() -> None:
