@@ -35,6 +35,11 @@ NOTES = (
     "dora-rs offers no order, its nodes are processes, the planner in every mode.",
 )
 
+OVER_ROUNDS = (
+    "Figures are medians over {} rounds (lowest-highest round). Of maxima, longest gaps, order "
+    "violations and worst reactions, the worst round counts."
+)
+
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse the options of this benchmark."""
@@ -174,10 +179,7 @@ def report(
         sections.append(render([("reaction", "unit", OURS), *rows]))
     sections.append(render(agv_report.target_rows(runs)))
     rounds = max((run.round for run in runs), default=0)
-    ending = [
-        f"Figures are medians over {rounds} round{'s' if rounds != 1 else ''}"
-        f"{' (lowest-highest round); max and longest are the worst of all' if rounds > 1 else ''}."
-    ]
+    ending = [OVER_ROUNDS.format(rounds)] if rounds > 1 else []
     ending += [f"{label}: {why}" for label, why in missing.items()]
     sections.append("\n".join([*ending, *harness.failures(runs)]))
     return "\n\n".join(sections)

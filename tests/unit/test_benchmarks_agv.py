@@ -10,18 +10,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import horus
 from benchmarks import agv, agv_report, cyclictest, harness, peers
 from benchmarks.agv_report import CYCLICTEST, MotorFigures, motor_figures
 from benchmarks.agv_workloads import scenario
 from benchmarks.harness import ChildRun
 from benchmarks.micro import OURS
+from horus.spec import ExecutionClass
 
 MS = 1_000_000
 PEER = "peer"
@@ -218,6 +220,17 @@ def test_targets_of_a_busy_planner_are_met_up_to_their_bounds() -> None:
     assert [row[-1] for row in rows] == ["met", "missed", "missed"]
 
 
+def test_what_must_not_happen_must_not_happen_in_any_round() -> None:
+    """One order violation in one of three rounds misses the target, and shows in the table."""
+    seen = list(range(3500))
+    violated = [*seen[:2000], 1999, *seen[2001:]]
+    runs = [our_run(number, 50, "thread", safety_seen=seen) for number in (1, 2)]
+    runs.append(our_run(3, 50, "thread", safety_seen=violated))
+    order = agv_report.target_rows(runs)[2]
+    assert order[2:] == ("0 (0-2.50)", "≤ 0", "missed")
+    assert agv_report.agv_rows(runs, "thread", [OURS])[1][-1] == "2.50"
+
+
 def test_every_freeze_must_be_reacted_to_in_time() -> None:
     """The excess is the reaction less the timeout; infinite if one freeze had no reaction."""
     worst = agv_report.excess_ms("rt", 100.0)
@@ -395,6 +408,21 @@ def test_without_matplotlib_there_is_no_picture_and_everything_else(
     assert json.loads(samples.read_text(encoding="utf-8"))["runs"]
 
 
+@pytest.mark.parametrize(("expirations", "status"), [(0, 0), (1, 1)])
+def test_a_soak_fails_if_a_healthy_node_was_reported_frozen(
+    monkeypatch: pytest.MonkeyPatch, expirations: int, status: int
+) -> None:
+    """It runs for the minutes asked for, and nothing else is run."""
+
+    def run(contender: harness.Contender, workload: str, **_options: object) -> ChildRun:
+        assert contender.arguments[-2:] == ("--seconds", "90.0")
+        series = {"rt": [99, 100], "watchdog_expirations": [expirations]}
+        return ChildRun(round=1, workload=workload, contender=contender.label, series=series)
+
+    monkeypatch.setattr(harness, "run_child", run)
+    assert agv.main(["--soak", "1.5"]) == status
+
+
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_run_takes_its_children_along(number: signal.Signals, status: int) -> None:
     """The exit status is the shell's for a signal, and there is no traceback."""
@@ -484,6 +512,30 @@ def test_every_node_of_the_dora_dataflow_is_ticked_and_fed(
         period_ms = int(timer.removeprefix("dora/timer/millis/"))
         assert scenario.RATES_HZ[node["id"]] * period_ms == 1000
         assert outputs.issuperset(sources)
+
+
+def test_the_soak_has_nodes_of_every_class_from_one_kilohertz_to_one_in_five_seconds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A class that is not there would not be watched."""
+    monkeypatch.syspath_prepend(str(agv.CHILDREN))
+    nodes = importlib.import_module("reaction").soak_nodes(Counter())
+    scheduler = horus.Scheduler()
+    for node, _ in nodes:
+        scheduler.add(node)
+    classes = {row.execution_class for row in scheduler.timing_report().rows}
+    assert classes == {each.value for each in ExecutionClass}
+    rates_hz = [rate_hz for _, rate_hz in nodes]
+    assert (min(rates_hz), max(rates_hz)) == (0.2, 1000.0)
+
+
+@pytest.mark.realtime
+def test_a_frozen_node_is_reacted_to_while_it_is_frozen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not before its timeout; the node blocks the event loop."""
+    monkeypatch.syspath_prepend(str(agv.CHILDREN))
+    freeze_once = importlib.import_module("reaction").freeze_once
+    (reaction_ns,) = freeze_once(None, time.sleep)
+    assert reaction_ns >= 0.99 * scenario.CRITICAL_TIMEOUT_MS * MS
 
 
 @pytest.mark.realtime
