@@ -10,8 +10,10 @@ from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
 from horus.loop.realtime import RealTime
 from horus.tick_path import build_tick
+from horus.units import NS_PER_US
 
 _LEAD_STEP_NS = 500
+_LAST_CHANCE_NS = 200 * NS_PER_US
 
 
 class RtThread(NodeThread):
@@ -30,7 +32,8 @@ class RtThread(NodeThread):
     ones are skipped, and the next one stays where it always was. A predecessor
     holds a node up for as long as the node can still meet its own deadline, and
     not at all once it is frozen, past the deadline of an earlier release: the node
-    then runs out of order, which is counted.
+    then runs out of order, which is counted. If it was the machine that was late, the
+    predecessor has 200 us more.
 
     Waking up takes a few microseconds when the machine is idle, and a hundred when
     another thread has the interpreter. How long it took lately is `_lead_ns`: the
@@ -53,6 +56,8 @@ class RtThread(NodeThread):
         self._index = 0
         self._release_ns = 0
         self._violated_ns = clock.NEVER
+        self._pardoned_ns = clock.NEVER
+        self._pardon_ends_ns = clock.NEVER
         self._owed_from_ns = clock.NEVER
         self._spin_ns = real_time.spin_ns
         self._most_lead_ns = 0
@@ -146,7 +151,10 @@ class RtThread(NodeThread):
     def _wait_for_baton(self, predecessor: RtThread, release_ns: int, now_ns: int) -> bool:
         """Sleep until a predecessor is done; return False if this node must not wait for it."""
         limit_ns = self._latest_start_ns(release_ns)
-        if now_ns >= limit_ns or predecessor.is_behind(release_ns, now_ns):
+        behind = predecessor.is_behind(release_ns, now_ns)
+        if now_ns >= limit_ns and not behind:
+            limit_ns = self._last_chance_ns(release_ns, limit_ns, now_ns)
+        if now_ns >= limit_ns or behind:
             self._note_violation(predecessor, release_ns)
             return False
         if self not in predecessor._waiting:
@@ -157,6 +165,25 @@ class RtThread(NodeThread):
             self.park(limit_ns - now_ns)
         self._owed_from_ns = min(self._now_ns(), limit_ns)
         return True
+
+    def _last_chance_ns(self, release_ns: int, limit_ns: int, now_ns: int) -> int:
+        """Return until when the predecessors have one more chance, once per release [ns].
+
+        Past the latest start, and none of them computes for that long: then the machine
+        was late, not they. They can run now as we can, in microseconds, and in order.
+        """
+        if self._pardoned_ns != release_ns:
+            self._pardoned_ns = release_ns
+            waited_for = (other for other in self._awaited if other.done_ns < release_ns)
+            if any(other.has_computed_since(limit_ns) for other in waited_for):
+                return limit_ns
+            self._pardon_ends_ns = now_ns + _LAST_CHANCE_NS
+        return max(limit_ns, self._pardon_ends_ns)
+
+    def has_computed_since(self, instant_ns: int) -> bool:
+        """Return whether a tick is in progress that began before an instant [ns]."""
+        context = self.live.tick_context
+        return context.ticking and context.start_ns < instant_ns
 
     def _latest_start_ns(self, release_ns: int) -> int:
         """Return how long this node can wait and still meet its deadline [ns].
