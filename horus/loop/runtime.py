@@ -159,9 +159,13 @@ class Runtime:
             # At once, not when the loop gets to it: a tick that asks for a stop is
             # the last of its node.
             live.leave_service()
-        self._post(self._stop_event.set)
+        self._post(self._end_waiting, at_once=False)
         if self._ending is not None:
             self._ending.expect()
+
+    def _end_waiting(self) -> None:
+        if self._stop_requested:
+            self._stop_event.set()
 
     def rearm(self) -> None:
         """Forget an earlier stop: another `play` is about to begin.
@@ -224,11 +228,13 @@ class Runtime:
         """
         return list(self._homes.copy().items())
 
-    def _post(self, note: Callable[[], None]) -> None:
+    def _post(self, note: Callable[[], None], *, at_once: bool = True) -> None:
         """Do something on the loop's thread: now if this is it, else soon.
 
         Before the loop is open, notes wait; when the run is over, nobody takes part
-        any more and they are done here and now.
+        any more and they are done here and now. With `at_once=False` the loop does
+        it in any case: a signal handler may have interrupted it anywhere, also where
+        it has looked at an event and does not wait for it yet.
 
         Thread: any.
         """
@@ -239,8 +245,10 @@ class Runtime:
                 return
         if bridge is None:
             note()
-        else:
+        elif at_once:
             bridge.run(note)
+        else:
+            bridge.post(note)
 
     # -- the run ------------------------------------------------------------------
 
