@@ -6,10 +6,11 @@ import functools
 from collections import deque
 from concurrent.futures import Future
 
+from horus.event_tick import EventTick
 from horus.executors.async_io import TaskRunner
 from horus.executors.base import LoopExecutor
 from horus.executors.thread import NodeThread, ThreadExecutor
-from horus.live import EventTick, LiveNode
+from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
 from horus.loop.executor import Executor

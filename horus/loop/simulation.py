@@ -9,8 +9,9 @@ from collections.abc import Callable, Collection, Iterable
 
 from horus.clock import FOREVER_NS, SimClock, Timeline
 from horus.errors import StateError
+from horus.event_tick import EventTick
 from horus.graph import contradictions, dataflow_order
-from horus.live import EventTick, LiveNode
+from horus.live import LiveNode
 from horus.loop.inspector import Inspector
 from horus.loop.private_loop import VirtualLoop
 from horus.loop.releases import ReleaseQueue

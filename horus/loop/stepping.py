@@ -15,7 +15,8 @@ from concurrent.futures import Future
 
 from horus import clock
 from horus.clock import Timeline
-from horus.live import EventTick, LiveNode
+from horus.event_tick import EventTick
+from horus.live import LiveNode
 from horus.loop.executor import Home
 from horus.loop.private_loop import StepLoop, StuckError
 from horus.loop.safety import HOOK_TIMEOUT_S, Safety

@@ -19,7 +19,7 @@ LAYERS = [
     ["topics", "graph", "escalation", "stream", "reports"],
     ["core"],
     ["node", "live"],
-    ["tick_path"],
+    ["tick_path", "event_tick"],
     ["loop"],
     ["executors"],
     ["registry", "unavailable"],
