@@ -203,6 +203,8 @@ class Session:
             self._watched = True
             if self._supervisor is not None:
                 self._supervisor.look_again()
+            if isinstance(self._stepper, Simulation):
+                self._stepper.look_again()
 
     def clear_safe_state(self) -> list[str]:
         """Let the nodes tick again that are held; return the names of those that cannot yet.

@@ -6,6 +6,7 @@ import functools
 import logging
 from collections.abc import Callable
 
+from horus.clock import NEVER
 from horus.live import LiveNode
 from horus.loop.hooks import Report
 from horus.loop.safety import Safety
@@ -56,6 +57,10 @@ class Inspector:
     def next_ns(self) -> int:
         """When to `inspect` again [ns]."""
         return self._watchdog.next_ns
+
+    def look_again(self) -> None:
+        """Take note that something has changed that `next_ns` depends on."""
+        self._watchdog.next_ns = NEVER
 
     def inspect(self) -> None:
         """Find what has run out by now, and act."""

@@ -83,9 +83,7 @@ class Safety:
             StateError: A critical node is still frozen. Nothing has changed.
         """
         lives = tuple(lives)
-        frozen = [
-            live.name for live in lives if live.critical_ns and live.frozen_for(live.critical_ns)
-        ]
+        frozen = [live.name for live in lives if _is_critical_and_frozen(live)]
         if self.active and frozen:
             raise StateError(
                 f"the safe state stays: {', '.join(frozen)} is critical and still frozen"
@@ -114,3 +112,10 @@ class Safety:
         owed = [live for live in held if live.claim_hook()]
         if owed:
             self._call_hooks(owed)
+
+
+def _is_critical_and_frozen(live: LiveNode) -> bool:
+    if live.critical_ns is None:
+        return False
+    # By its health if it is due and cannot begin.
+    return live.health in (Health.WARNING, Health.UNHEALTHY) or live.frozen_for(live.critical_ns)

@@ -227,6 +227,10 @@ class Simulation(Stepper):
 
     # -- supervision -----------------------------------------------------------------
 
+    def look_again(self) -> None:
+        """Take note that nodes have come, or that a timeout has changed."""
+        self._inspector.look_again()
+
     def thread_id(self, live: LiveNode) -> int | None:
         """Return None: no tick keeps another from its thread."""
         return None

@@ -63,6 +63,28 @@ def test_clear_safe_state_lets_the_nodes_tick_again(make, way):
         assert expirations(sched, "critical") == 1
 
 
+def test_the_safe_state_stays_while_the_critical_node_cannot_begin(make):
+    """A critical node that still waits for its thread is as frozen as one that runs on."""
+    sched = make(watchdog_ms=60_000)
+    witness, blocker = Witness(sched), Freezer(armed=False)
+    sched.add(freezing_node("BestEffort", blocker, "blocker", order=0))
+    witness.add("BestEffort", "critical", order=1)
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    with running(sched), blocker:
+        wait_until(lambda: witness.all_tick())
+        blocker.freeze()
+        wait_until(lambda: witness.names("hook") == ["critical"])
+        with pytest.raises(StateError, match="critical is critical and still frozen"):
+            sched.clear_safe_state()
+        assert in_safe_state(sched)
+        blocker.thaw()
+        wait_until(lambda: cleared(sched))
+        held_at = witness.ticks["critical"]
+        wait_until(lambda: witness.ticks["critical"] > held_at)
+
+        assert witness.names("hook") == ["critical"]
+
+
 @pytest.mark.parametrize("way", WAYS)
 def test_an_isolated_node_ticks_again_once_its_tick_has_returned(make, way):
     """clear_safe_state() names nodes that cannot tick yet, and frees them when they can."""

@@ -284,6 +284,35 @@ def test_a_restart_whose_init_hangs_is_isolated(reports: Reports) -> None:
     assert sched.get_node_stats("frozen")["restarts"] == 0
 
 
+def test_a_node_that_comes_later_is_watched_from_its_first_tick(reports: Reports) -> None:
+    """Also if nobody was watched before: the rows come at their instants."""
+    sched = Scheduler(tick_rate=10, deterministic=True)
+    sched.add(Node("busy", script(*[0.9] * 10), rate=1))
+    sched.tick_for(2.0)
+    sched.add(frozen([], FOREVER_S, watchdog=0.15))
+    sched.tick_for(1.0)
+    sched.stop()
+
+    assert [entry[0] for entry in reports.entries] == [2.15, 2.3, 2.45]
+
+
+def test_a_node_that_becomes_critical_during_its_tick_is_so_at_its_timeout(
+    reports: Reports,
+) -> None:
+    """add_critical_node() counts from the release, not from when somebody next looks."""
+    sched = Scheduler(tick_rate=10, deterministic=True, watchdog_ms=5000)
+    sched.add(frozen([], FOREVER_S))
+    sched.add(
+        Node("late", lambda: sched.add_critical_node("frozen", timeout_ms=650), rate=2, order=1)
+    )
+    sched.tick_for(0.1)
+    sched.add_critical_node("frozen", timeout_ms=700)
+    sched.tick_for(2.0)
+    sched.stop()
+
+    assert [entry[0] for entry in reports.entries if entry[1] == "CRITICAL"] == [0.65]
+
+
 # -- reproducible ----------------------------------------------------------------------------------
 
 
