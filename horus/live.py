@@ -160,6 +160,12 @@ class LiveNode:
         return self.tick_context.start_ns if self.ticking else clock.NEVER
 
     @property
+    def after_tick(self) -> bool:
+        """Whether the tick has ended, and the safe-state hook that it has led to has not."""
+        context = self.tick_context
+        return context.ticking and context.finish_ns > context.start_ns
+
+    @property
     def busy(self) -> bool:
         """Whether a tick, or `init()` in its place, is in progress."""
         return self.busy_since_ns != clock.NEVER

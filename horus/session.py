@@ -360,6 +360,8 @@ class Session:
                 make_executors,
                 self._spec.shutdown_timeout_ns,
             )
+        if self._notifier is not None and self._notifier.watchdog_s is not None:
+            self._supervise().notify(self._notifier)
         signals = self._signals
         self._runtime.way_out = signals if signals and signals.owns else None
         if self.control.stopping:
@@ -398,8 +400,6 @@ class Session:
                 self._members,
                 self.fault_log,
             )
-            if self._notifier is not None:
-                self._supervisor.notify(self._notifier)
         return self._supervisor
 
     def _report(self, write: Callable[[], None]) -> None:

@@ -56,6 +56,7 @@ def build_tick(live: LiveNode) -> RunTick:
                 error = never_awaited("tick")
         except BaseException as exc:
             if _is_interrupt(exc):
+                context.ticking = False
                 live.control.request_stop("KeyboardInterrupt")
                 raise
             error = exc
@@ -99,6 +100,7 @@ def build_async_tick(live: LiveNode) -> RunTickAsync:
             error = exc
         except BaseException as exc:
             if _is_interrupt(exc):
+                context.ticking = False
                 live.control.request_stop("KeyboardInterrupt")
                 raise
             error = exc

@@ -61,7 +61,9 @@ class TaskRunner:
         A safe-state hook that the tick has led to is not cut short.
         """
         tick = self._ticks.get(live)
-        if tick is not None and live.busy and tick.task is not _current_task():
+        if tick is None or not live.busy or live.after_tick:
+            return
+        if tick.task is not _current_task():
             tick.task.cancel()
 
     def due_ns(self, live: LiveNode) -> int | None:

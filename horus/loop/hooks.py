@@ -53,12 +53,19 @@ class HookCaller:
 
     def start(self, lives: Iterable[LiveNode]) -> None:
         """Call the hooks of these nodes, in this order; return at once."""
-        _start_thread(lambda: self.call(lives), "horus-safe-state")
+        _start_thread(lambda: self._call_alive(lives), "horus-safe-state")
 
     def call(self, lives: Iterable[LiveNode]) -> None:
         """Call the hooks of these nodes, in this order, each for a bounded time."""
         for live in lives:
             self._call_one(live)
+
+    def _call_alive(self, lives: Iterable[LiveNode]) -> None:
+        for live in lives:
+            if live.initialized:
+                self._call_one(live)
+            else:
+                live.hook_returned.set()  # shut down meanwhile: nothing may follow
 
     def _call_one(self, live: LiveNode) -> None:
         # Its last command must come before the hook's, not after.

@@ -51,13 +51,15 @@ class Safety:
             if self.reason is not None:
                 return False
             self.reason = reason
-        self._hold(sorted(lives, key=lambda live: live.rank, reverse=True))
+            owed = self._hold(sorted(lives, key=lambda live: live.rank, reverse=True))
+        self._call(owed)
         return True
 
     def join(self, live: LiveNode) -> None:
         """See to it that a node that begins to take part does not tick in the safe state."""
-        if self.active:
-            self._hold([live])
+        with self._lock:
+            owed = self._hold([live]) if self.active else []
+        self._call(owed)
 
     def isolate(self, live: LiveNode, ticks: int) -> bool:
         """Take a frozen node out of the schedule; return False if its tick has just ended.
@@ -83,23 +85,21 @@ class Safety:
             StateError: A critical node is still frozen. Nothing has changed.
         """
         lives = tuple(lives)
-        frozen = [live.name for live in lives if _is_critical_and_frozen(live)]
-        if self.active and frozen:
-            raise StateError(
-                f"the safe state stays: {', '.join(frozen)} is critical and still frozen"
-            )
-        self.reason = None
+        self._refuse_if_frozen(lives)
         for live in lives:
             # Hooks that have just been called have the time that they are given anyway.
             live.hook_returned.wait(HOOK_TIMEOUT_S)
         remain = []
-        for live in lives:
-            if not live.held:
-                continue
-            if not live.hook_returned.is_set() or (live.health is Health.ISOLATED and live.busy):
-                remain.append(live.name)
-            else:
-                live.free()
+        with self._lock:
+            # Again: one that froze meanwhile has found the safe state active.
+            self._refuse_if_frozen(lives)
+            self.reason = None
+            for live in lives:
+                frozen = live.health is Health.ISOLATED and live.busy
+                if live.held and (frozen or not live.hook_returned.is_set()):
+                    remain.append(live.name)
+                elif live.held:
+                    live.free()
         _log.warning("safe state cleared%s", f"; still held: {', '.join(remain)}" if remain else "")
         return remain
 
@@ -107,9 +107,19 @@ class Safety:
         """Forget everything: a new session begins."""
         self.reason = None
 
-    def _hold(self, lives: Iterable[LiveNode]) -> None:
+    def _refuse_if_frozen(self, lives: Iterable[LiveNode]) -> None:
+        frozen = [live.name for live in lives if _is_critical_and_frozen(live)]
+        if self.active and frozen:
+            raise StateError(
+                f"the safe state stays: {', '.join(frozen)} is critical and still frozen"
+            )
+
+    def _hold(self, lives: Iterable[LiveNode]) -> list[LiveNode]:
+        """Hold nodes that have a hook; return those whose hook is to be called."""
         held = [live for live in lives if live.has_hook and live.initialized and live.hold()]
-        owed = [live for live in held if live.claim_hook()]
+        return [live for live in held if live.claim_hook()]
+
+    def _call(self, owed: list[LiveNode]) -> None:
         if owed:
             self._call_hooks(owed)
 

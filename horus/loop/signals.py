@@ -47,6 +47,7 @@ class SignalOwner:
         self._last_act = last_act
         self._in_callback = in_callback
         self._received = 0
+        self._pid = os.getpid()
         self._interrupting = False
         self.owns = False
         """Whether the signals are ours: only the main thread can own them."""
@@ -87,6 +88,11 @@ class SignalOwner:
         _end(128 + self._received if self._received else 1, why, self._last_act)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() != self._pid:
+            # A forked child, which is not the robot: here a signal means what it always does.
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
         if self._interrupting:
             self._interrupting = False
             # Anywhere else an exception would hit what only just keeps order.

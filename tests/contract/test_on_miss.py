@@ -344,7 +344,7 @@ def test_stop_stops_the_entire_scheduler_in_real_time(make, loop, kind):
     def tick(node):
         time.sleep(5 * ms)
 
-    sched.add(node_of(kind, "safety_monitor", tick, rate=20, on_miss="stop"))
+    sched.add(node_of(kind, "safety_monitor", tick, rate=2, on_miss="stop"))
     sched.set_tick_budget("safety_monitor", 1000)
     sched.add(Node("other", nothing, shutdown=lambda: down.append(1)))
     sched.publish(TRIGGER, 1)

@@ -142,7 +142,9 @@ def test_a_manager_that_does_not_listen_is_no_trouble(make, monkeypatch, environ
     assert sched.get_node_stats("node")["total_ticks"] > 0
 
 
-def test_a_watchdog_that_is_meant_for_another_process_is_not_fed(make, manager, monkeypatch):
+def test_a_watchdog_that_is_meant_for_another_process_is_not_fed(
+    make, manager, monkeypatch, caplog
+):
     """WATCHDOG_PID names another process: READY=1 and STOPPING=1 are sent all the same."""
     monkeypatch.setenv("WATCHDOG_PID", "1")
     sched = make()
@@ -150,3 +152,4 @@ def test_a_watchdog_that_is_meant_for_another_process_is_not_fed(make, manager, 
     sched.run(duration=0.3)
     wait_until(lambda: "STOPPING=1" in manager.states())
     assert set(manager.states()) == {"READY=1", "STOPPING=1"}
+    assert "failed" not in caplog.text
