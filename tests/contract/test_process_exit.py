@@ -45,10 +45,11 @@ def test_a_callback_that_blocks_the_main_thread_is_interrupted_when_the_run_is_t
         "    print('down', node.name, flush=True)\n"
         "sched = Scheduler(shutdown_timeout=0.3)\n"
         "callbacks = {'tick': lambda node: None, 'shutdown': down}\n"
-        "sched.add(Node('motor', rate=100, order=0, **callbacks))\n"
+        "def stop_soon(node):\n"
+        "    threading.Timer(0.2, sched.stop).start()\n"
+        "sched.add(Node('motor', rate=100, order=0, init=stop_soon, **callbacks))\n"
         f"callbacks['{phase}'] = blocks\n"
         "sched.add(Node('stuck', order=1, **callbacks))\n"
-        "threading.Timer(0.2, sched.stop).start()\n"
         "sched.run()\n"
         "print('returned')\n"
     )
@@ -135,8 +136,13 @@ def test_a_main_thread_that_is_lost_in_an_extension_ends_the_process():
 
 
 SECOND_SIGNAL = """
-    import threading, time
+    import time
     from horus import Node, Scheduler
+
+    def tell(node, said=[]):
+        if not said:
+            said.append(1)
+            print("running", flush=True)
 
     def safe(node):
         print("safe", node.name, flush=True)
@@ -150,8 +156,7 @@ SECOND_SIGNAL = """
     sched = Scheduler()
     for order, name in enumerate(("first", "hangs", "last")):
         sched.add(Node(name, lambda node: None, rate=100, order=order, safe_state=safe))
-    sched.add(Node("slow", lambda node: None, order=9, safe_state=safe, shutdown=slow_end))
-    threading.Timer(0.2, lambda: print("running", flush=True)).start()
+    sched.add(Node("slow", tell, order=9, safe_state=safe, shutdown=slow_end))
     sched.run()
 """
 
