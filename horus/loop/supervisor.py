@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import gc
 import itertools
@@ -10,6 +11,7 @@ import logging
 from collections.abc import Callable, Coroutine
 from typing import Any
 
+from horus import os_rt
 from horus.clock import FOREVER_NS, Timeline
 from horus.live import LiveNode
 from horus.loop.bridge import Bridge
@@ -158,4 +160,11 @@ async def _collect_garbage() -> None:
     """
     for second in itertools.count(1):
         await asyncio.sleep(1.0)
-        gc.collect(2 if second % _SECONDS_PER_FULL_COLLECTION == 0 else 1)
+        await asyncio.to_thread(_collect, 2 if second % _SECONDS_PER_FULL_COLLECTION == 0 else 1)
+
+
+def _collect(generation: int) -> None:
+    """Collect garbage on a thread of its own: finalizers are other people's code, and may hang."""
+    with contextlib.suppress(OSError):
+        os_rt.run_first()
+    gc.collect(generation)

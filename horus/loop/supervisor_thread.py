@@ -10,6 +10,8 @@ from collections.abc import Callable, Coroutine
 from queue import SimpleQueue
 from typing import Any
 
+from horus.loop.daemon_pool import DaemonPool
+
 _log = logging.getLogger("horus.supervisor")
 
 _LAST_REPORTS_S = 1.0
@@ -30,6 +32,7 @@ class SupervisorThread:
         """Prepare the thread of the scheduler called `name`; `enter_thread` sets it up."""
         self._enter_thread = enter_thread
         self.loop = asyncio.new_event_loop()
+        self.loop.set_default_executor(DaemonPool("horus-supervisor-work"))
         self._tasks: set[asyncio.Task[None]] = set()
         self._reports: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._thread = threading.Thread(
