@@ -119,6 +119,7 @@ def test_a_tick_that_returns_in_time_restores_health(make, way, caplog):
         assert expirations(sched) == 1
 
 
+@pytest.mark.parametrize("way", ["BestEffort", "async Event", "Rt", "Compute"])
 def test_expirations_are_cumulative_one_for_each_frozen_tick(make, way):
     """watchdog_expirations counts frozen ticks: one each, whatever stage they reached."""
     sched = make(watchdog_ms=TIMEOUT_MS)
@@ -140,6 +141,7 @@ def test_expirations_are_cumulative_one_for_each_frozen_tick(make, way):
         assert sched.safety_stats()["watchdog_expirations"] == 2
 
 
+@pytest.mark.parametrize("way", ["BestEffort", "urgent Event", "AsyncIo", "Rt"])
 def test_the_reaction_comes_within_the_timeout_and_little_more(make, way):
     """A watchdog that was given 200 ms does not take a second, nor bark before its time."""
     sched = make(watchdog_ms=200)
@@ -203,6 +205,7 @@ def test_without_a_timeout_nothing_is_watched(make, way):
         assert sched.safety_stats()["health_states"] == {"frozen": "healthy"}
 
 
+@pytest.mark.parametrize("way", ["Event", "AsyncIo", "Rt", "Compute"])
 def test_a_node_that_is_added_while_running_is_watched(make, way):
     """The watchdog looks after nodes that come later, with a timeout of their own, too."""
     sched = make()

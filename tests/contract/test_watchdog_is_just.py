@@ -95,7 +95,7 @@ def test_messages_that_waited_between_two_runs_are_not_a_frozen_tick(make, way):
     sched.tick_for(0.1)
     seen = len(ticks)
     assert seen < 50
-    time.sleep(5 * TIMEOUT_MS * ms)
+    time.sleep(3.5 * TIMEOUT_MS * ms)
     sched.tick_for(0.1)
 
     assert len(ticks) > seen

@@ -144,7 +144,7 @@ def test_a_hundred_starts_and_stops_leave_the_process_as_it_was(loop: str) -> No
 def test_a_scheduler_that_is_new_each_time_leaves_nothing_either() -> None:
     """Not even what is made once per scheduler stays when the scheduler goes."""
     with Unchanged():
-        for _ in range(20):
+        for _ in range(10):
             mixed(rt=True, watchdog_ms=500).run(0.004)
 
 
@@ -240,7 +240,7 @@ def test_every_way_to_end_leaves_the_process_as_it_was(end: Callable[[Scheduler]
     """Isolation, a fatal error, a signal, a cancellation, steps: all of it is undone."""
     end(mixed(rt=True, watchdog_ms=500))
     with Unchanged():
-        for _ in range(4):
+        for _ in range(2):
             end(mixed(rt=True, watchdog_ms=500))
 
 
