@@ -8,12 +8,14 @@ applied without it, too, as well as they can be.
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 import logging
 import math
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 
 from horus import os_rt
 from horus.live import LiveNode
@@ -126,19 +128,19 @@ class RealTime:
     @contextlib.contextmanager
     def in_loop_thread(self) -> Iterator[None]:
         """Pin the event loop's thread and make its timers exact, then put both back."""
-        cores = os_rt.affinity()
-        with contextlib.ExitStack() as undo:
+        with _thread_put_back() as undo:
             if self._cores is not None:
+                undo.setdefault("cores", functools.partial(os_rt.run_on, os_rt.affinity()))
                 self._pin(self._cores, "the scheduler")
-                undo.callback(os_rt.run_on, cores)
             with contextlib.suppress(OSError):
-                undo.callback(os_rt.set_timer_slack, os_rt.timer_slack_ns())
+                slack_ns = os_rt.timer_slack_ns()
                 os_rt.set_timer_slack(_TIMER_SLACK_NS)
+                undo.setdefault("slack", functools.partial(os_rt.set_timer_slack, slack_ns))
             if self._rt:
                 with contextlib.suppress(OSError):
                     before = os_rt.niceness()
                     os_rt.run_first()
-                    undo.callback(os_rt.run_ordinarily, before)
+                    undo.setdefault("niceness", functools.partial(os_rt.run_ordinarily, before))
             yield
 
     @contextlib.contextmanager
@@ -187,6 +189,38 @@ def capabilities() -> dict[str, object]:
         "preempt_rt": os_rt.is_preempt_rt(),
         "kernel": f"{os.uname().sysname} {os.uname().release}" if hasattr(os, "uname") else "",
     }
+
+
+@dataclass(slots=True)
+class _ChangedThread:
+    """A thread that runs have changed, and what undoes the first change of each kind."""
+
+    undo: dict[str, Callable[[], None]] = field(default_factory=dict)
+    users: int = 0
+
+
+_changed_threads: dict[int, _ChangedThread] = {}
+
+
+@contextlib.contextmanager
+def _thread_put_back() -> Iterator[dict[str, Callable[[], None]]]:
+    """Undo what was changed in the calling thread once no run on it needs that any more.
+
+    Runs that share an event loop end in any order: the last to end, not the first to
+    have begun, puts back what there was before all of them.
+    """
+    thread_id = threading.get_ident()
+    changed = _changed_threads.setdefault(thread_id, _ChangedThread())
+    changed.users += 1
+    try:
+        yield changed.undo
+    finally:
+        changed.users -= 1
+        if changed.users == 0:
+            del _changed_threads[thread_id]
+            with contextlib.ExitStack() as all_of_it:
+                for undo in changed.undo.values():
+                    all_of_it.callback(undo)
 
 
 _process_lock = threading.Lock()
