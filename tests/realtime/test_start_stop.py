@@ -33,6 +33,24 @@ def status(*fields: str) -> dict[str, str]:
     return {field: pairs[field].strip() for field in fields}
 
 
+def tuning() -> dict[str, Any]:
+    """Return what real-time scheduling may change of this process and thread."""
+    return {
+        "policy": os.sched_getscheduler(0),
+        "priority": os.sched_getparam(0).sched_priority,
+        "niceness": os.getpriority(os.PRIO_PROCESS, threading.get_native_id()),
+        "cores": os.sched_getaffinity(0),
+        "timer slack": timer_slack_ns(),
+        "locked memory": status("VmLck"),
+        "automatic collection": (gc.isenabled(), gc.get_threshold(), gc.get_freeze_count()),
+        "switch interval": sys.getswitchinterval(),
+    }
+
+
+TUNING = tuning() if sys.platform == "linux" else {}
+"""What they were before the first run of this process."""
+
+
 def settings() -> dict[str, Any]:
     """Return everything of this process and thread that a run may change."""
     wakeup_fd = signal.set_wakeup_fd(-1)
@@ -44,16 +62,9 @@ def settings() -> dict[str, Any]:
         },
         "signals": status("SigCgt", "SigIgn", "SigBlk"),
         "wake-up descriptor": wakeup_fd,
-        "policy": os.sched_getscheduler(0),
-        "priority": os.sched_getparam(0).sched_priority,
-        "niceness": os.getpriority(os.PRIO_PROCESS, threading.get_native_id()),
-        "cores": os.sched_getaffinity(0),
-        "timer slack": timer_slack_ns(),
-        "locked memory": status("VmLck"),
-        "automatic collection": (gc.isenabled(), gc.get_threshold(), gc.get_freeze_count()),
-        "switch interval": sys.getswitchinterval(),
         "log": (log.level, list(log.handlers), list(logging.getLogger().handlers)),
         "excepthooks": (sys.excepthook, threading.excepthook, sys.unraisablehook),
+        **tuning(),
     }
 
 
@@ -81,6 +92,7 @@ class Unchanged:
         if kind is not None:
             return
         assert settings() == self._settings
+        assert tuning() == TUNING
         give_up_at = time.monotonic() + GRACE_S
         while belongings() != self._belongings and time.monotonic() < give_up_at:
             gc.collect()
@@ -136,7 +148,8 @@ def test_a_hundred_starts_and_stops_leave_the_process_as_it_was(loop: str) -> No
     # It was not for want of anything to change.
     assert during[0]["switch interval"] < sys.getswitchinterval()
     assert during[0]["signals"] != settings()["signals"]
-    assert during[0]["automatic collection"] != settings()["automatic collection"]
+    for name in ("automatic collection", "cores", "timer slack"):
+        assert during[0][name] != TUNING[name], name
     if sched.capabilities()["memory_locking"]:
         assert during[0]["locked memory"] != settings()["locked memory"]
 
@@ -242,6 +255,27 @@ def test_every_way_to_end_leaves_the_process_as_it_was(end: Callable[[Scheduler]
     with Unchanged():
         for _ in range(2):
             end(mixed(rt=True, watchdog_ms=500))
+
+
+@pytest.mark.parametrize("first_to_end", ["first to begin", "last to begin"])
+def test_runs_that_share_an_event_loop_give_its_thread_back(first_to_end: str) -> None:
+    """In whatever order they end, the application's thread is what it was before both."""
+
+    async def main() -> None:
+        first = Scheduler(name="first", rt=True, cores=[0])
+        second = Scheduler(name="second", rt=True, cores=[max(os.sched_getaffinity(0))])
+        runs = [asyncio.ensure_future(first.arun())]
+        await asyncio.sleep(0.02)
+        runs.append(asyncio.ensure_future(second.arun()))
+        await asyncio.sleep(0.02)
+        assert timer_slack_ns() != TUNING["timer slack"]
+        ends = [first, second] if first_to_end == "first to begin" else [second, first]
+        for sched in ends:
+            sched.stop()
+            await runs[sched is second]
+
+    with Unchanged():
+        asyncio.run(main())
 
 
 def test_two_schedulers_at_once_give_back_what_they_share() -> None:
