@@ -89,7 +89,7 @@ class Inspector:
                 f"critical node {live.name} {_lasting(finding)}, longer than its limit of "
                 + readable(live.critical_ns if finding.critical else 3 * self._timeout_ns(live))
             )
-            entered = self._safety.enter(reason, self._watchdog.watched())
+            entered = self._safety.enter(reason, self._watchdog.watched)
         if news or entered:
             self._report(functools.partial(self._tell, finding, health, news, entered, stack))
 

@@ -41,7 +41,7 @@ class Safety:
         """Whether the system is in its safe state."""
         return self.reason is not None
 
-    def enter(self, reason: str, lives: Iterable[LiveNode]) -> bool:
+    def enter(self, reason: str, lives: Callable[[], Iterable[LiveNode]]) -> bool:
         """Enter the system-wide safe state; return False if it is in it already.
 
         The hook of every node is called, in shutdown order. Nodes without one
@@ -51,7 +51,8 @@ class Safety:
             if self.reason is not None:
                 return False
             self.reason = reason
-            owed = self._hold(sorted(lives, key=lambda live: live.rank, reverse=True))
+            # Asked for now: who begins to take part later finds the safe state active.
+            owed = self._hold(sorted(lives(), key=lambda live: live.rank, reverse=True))
         self._call(owed)
         return True
 
