@@ -128,7 +128,7 @@ def test_the_safe_state_can_be_entered_again(make):
     sched = make()
     witness, freezer = Witness(sched), Freezer(armed=False)
     witness.add("Rt", "motor", order=10)
-    sched.add(freezing_node("Rt", freezer, "critical", order=0))
+    sched.add(freezing_node("Rt", freezer, "critical", order=0, watchdog=60.0))
     sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
     with running(sched), freezer:
         for episode in (1, 2):
@@ -162,7 +162,7 @@ def test_the_same_while_the_system_is_in_its_safe_state(make):
     """A held node that is frozen, though not critical, stays so when it is let go."""
     sched = make()
     critical, other = Freezer(armed=False), Freezer(armed=False)
-    sched.add(freezing_node("Rt", critical, "critical"))
+    sched.add(freezing_node("Rt", critical, "critical", watchdog=60.0))
     sched.add(freezing_node("Compute", other, "other", watchdog=2 * TIMEOUT_MS * ms))
     sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
     with running(sched), critical, other:
@@ -186,7 +186,7 @@ def test_a_node_that_is_added_in_the_safe_state_is_held(make, kind):
     """A node that comes while the safe state is active joins it: hook, no ticks."""
     sched = make()
     witness, freezer = Witness(sched), Freezer()
-    sched.add(freezing_node("Rt", freezer, "critical"))
+    sched.add(freezing_node("Rt", freezer, "critical", watchdog=60.0))
     sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
     with running(sched), freezer:
         wait_until(lambda: in_safe_state(sched))
@@ -352,7 +352,7 @@ def test_clearing_waits_for_hooks_that_were_just_called(make):
         journal.append("tick")
 
     sched.add(Node("motor", tick, rate=100, safe_state=hook, order=10))
-    sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False))
+    sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False, watchdog=60.0))
     sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
     with running(sched), freezer:
         freezer.freeze()

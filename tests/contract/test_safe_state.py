@@ -69,7 +69,7 @@ def test_nodes_with_a_hook_are_held_and_nodes_without_tick_on(make, loop):
     for kind in kinds:
         witness.add(kind, f"{kind}_held")
         witness.add(kind, f"{kind}_free", hook=False)
-    sched.add(freezing_node("Rt", freezer, "critical", order=0))
+    sched.add(freezing_node("Rt", freezer, "critical", order=0, watchdog=60.0))
     sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
     with running(sched), freezer:
         wait_until(lambda: witness.all_tick())
@@ -100,7 +100,7 @@ def test_the_timeout_of_a_critical_node_is_its_own(make):
     sched = make(watchdog_ms=60_000)
     critical, other = Freezer(), Freezer()
     sched.add(freezing_node("Compute", other, "other"))
-    sched.add(freezing_node("Rt", critical, "critical"))
+    sched.add(freezing_node("Rt", critical, "critical", watchdog=60.0))
     sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
     with running(sched), critical, other:
         wait_until(lambda: in_safe_state(sched))
@@ -186,7 +186,7 @@ def test_a_hook_that_raises_or_hangs_does_not_stop_the_others(make, kind, caplog
     failing = as_async(fail) if kind == "AsyncIo" else fail
     sched.add(Node("hangs", raising, rate=50, order=30, safe_state=hanging))
     sched.add(Node("raises", raising, rate=50, order=20, safe_state=failing))
-    sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False))
+    sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False, watchdog=60.0))
     sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
     with running(sched), freezer, stuck:
         try:
