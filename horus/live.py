@@ -67,7 +67,8 @@ class LiveNode:
     """A node's run-time state.
 
     Thread: written by the thread that runs the node's callbacks; others read
-    single attributes, or set `gated` and `retired`, which are only ever looked at.
+    single attributes, set `gated` and `retired`, which are only ever looked at, and
+    change its health and whether it is held by methods that say so.
     """
 
     def __init__(

@@ -181,9 +181,9 @@ def _settle(
 
 def _tell_that_it_ended(live: LiveNode) -> None:
     if live.recovered():
-        live.reports.emit(logging.INFO, "healthy again")
+        live.emit(logging.INFO, "healthy again")
     elif live.health is Health.ISOLATED:
-        live.reports.emit(
+        live.emit(
             logging.WARNING, "its frozen tick has ended; clear_safe_state() lets it tick again"
         )
 

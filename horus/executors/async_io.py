@@ -133,13 +133,33 @@ class TaskRunner:
             future.set_result(success)
 
 
-class AsyncIoExecutor(LoopExecutor):
-    """Starts a task per release; a release that finds the node still busy is skipped."""
+class TaskExecutor(LoopExecutor):
+    """Base of the executors whose nodes may tick in tasks."""
 
     def __init__(self, bridge: Bridge, cycle: Cycle) -> None:
         """Serve the nodes of one run."""
         super().__init__(bridge, cycle)
         self._tasks = TaskRunner(bridge)
+
+    def cancel(self, live: LiveNode) -> None:
+        """Cancel an async tick in progress."""
+        self._tasks.cancel(live)
+
+    def computes(self, live: LiveNode) -> bool:
+        """Return whether the node's task has the loop at this moment."""
+        return self._tasks.computes(live)
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where the node's task waits, or where the loop is."""
+        return self._tasks.stack(live)
+
+    def isolate(self, live: LiveNode) -> None:
+        """Cancel an async tick in progress, as soon as the loop is free."""
+        self._bridge.post(lambda: self._tasks.cancel(live))
+
+
+class AsyncIoExecutor(TaskExecutor):
+    """Starts a task per release; a release that finds the node still busy is skipped."""
 
     def adopt(self, live: LiveNode) -> None:
         """Build the node's tick path."""
@@ -150,26 +170,10 @@ class AsyncIoExecutor(LoopExecutor):
         live.enter_service()
         self._cycle.add(live, self._release, from_ns)
 
-    def cancel(self, live: LiveNode) -> None:
-        """Cancel the tick in progress."""
-        self._tasks.cancel(live)
-
     def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
         """Return the release that waits for the loop."""
         started_ns = self._tasks.due_ns(live)
         return super().due_ns(live, now_ns) if started_ns is None else started_ns
-
-    def computes(self, live: LiveNode) -> bool:
-        """Return whether the node's task has the loop at this moment."""
-        return self._tasks.computes(live)
-
-    def stack(self, live: LiveNode) -> Stack:
-        """Return where the node's task waits."""
-        return self._tasks.stack(live)
-
-    def isolate(self, live: LiveNode) -> None:
-        """Cancel the tick in progress, as soon as the loop is free."""
-        self._bridge.post(lambda: self._tasks.cancel(live))
 
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
         """Run a callback in a task."""

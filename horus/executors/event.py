@@ -7,8 +7,7 @@ from collections import deque
 from concurrent.futures import Future
 
 from horus.event_tick import EventTick
-from horus.executors.async_io import TaskRunner
-from horus.executors.base import LoopExecutor
+from horus.executors.async_io import TaskExecutor, TaskRunner
 from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
 from horus.loop.bridge import Bridge
@@ -200,13 +199,12 @@ class ThreadEventExecutor(ThreadExecutor[EventThread]):
         """Do nothing: messages release the node."""
 
 
-class LoopEventExecutor(LoopExecutor):
+class LoopEventExecutor(TaskExecutor):
     """Wakes a node when its trigger topic receives a message."""
 
     def __init__(self, bridge: Bridge, cycle: Cycle) -> None:
         """Serve the nodes of one run."""
         super().__init__(bridge, cycle)
-        self._tasks = TaskRunner(bridge)
         self._runners: dict[LiveNode, _EventRunner] = {}
 
     def adopt(self, live: LiveNode) -> None:
@@ -227,26 +225,10 @@ class LoopEventExecutor(LoopExecutor):
         super().disengage(live)
         self._runners[live].ignore()
 
-    def cancel(self, live: LiveNode) -> None:
-        """Cancel an async tick in progress."""
-        self._tasks.cancel(live)
-
     def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
         """Return the arrival of the message whose tick has not begun."""
         runner = self._runners.get(live)
         return None if runner is None else runner.arrivals.due_ns()
-
-    def computes(self, live: LiveNode) -> bool:
-        """Return whether an async tick has the loop at this moment."""
-        return self._tasks.computes(live)
-
-    def stack(self, live: LiveNode) -> Stack:
-        """Return where the node's task waits, or where the loop is."""
-        return self._tasks.stack(live)
-
-    def isolate(self, live: LiveNode) -> None:
-        """Cancel an async tick in progress, as soon as the loop is free."""
-        self._bridge.post(lambda: self._tasks.cancel(live))
 
     def call(self, live: LiveNode, phase: str | None) -> Future[bool]:
         """Run a callback on the loop's thread."""

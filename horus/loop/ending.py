@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 from collections.abc import Callable
 from typing import Protocol
@@ -82,7 +83,7 @@ class Ending:
         await self._expected.wait()
         while not self._over:
             answered = asyncio.Event()
-            self._bridge.post(lambda answered=answered: self._supervisor.call(answered.set))  # type: ignore[misc]
+            self._bridge.post(functools.partial(self._supervisor.call, answered.set))
             if not await _within(self._patience_s, answered) and not await _within(
                 # Once more: a process that was suspended has had no chance.
                 _INTERRUPT_AGAIN_S,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import faulthandler
+import functools
 import logging
 import os
 import threading
@@ -21,6 +22,7 @@ from typing import IO
 
 import platformdirs
 
+from horus.loop.supervisor_thread import Report
 from horus.units import NS_PER_S, readable, to_s
 
 _log = logging.getLogger("horus.supervisor")
@@ -45,9 +47,7 @@ class FaultLog:
         self.path: Path | None = None
         """The file; None if there is none. It stays if something was written to it."""
 
-    async def keep_putting_off(
-        self, timeout_ns: Callable[[], int], report: Callable[[Callable[[], None]], None]
-    ) -> None:
+    async def keep_putting_off(self, timeout_ns: Callable[[], int], report: Report) -> None:
         """Put the writing off again and again; say so when it has happened.
 
         Args:
@@ -69,11 +69,11 @@ class FaultLog:
                         f"Python stood still for more than {readable(delay_ns)}; "
                         f"the stacks of all threads are in {self.path}"
                     )
-                    report(lambda message=message: _log.critical(message))  # type: ignore[misc]
+                    report(functools.partial(_log.critical, message))
         finally:
             self._close()
 
-    def _open(self, report: Callable[[Callable[[], None]], None]) -> bool:
+    def _open(self, report: Report) -> bool:
         """Open the file, once; return whether there is one."""
         if self._file is not None:
             return True
@@ -86,7 +86,7 @@ class FaultLog:
         except OSError as exc:
             _owned.release()
             message = f"no stacks will be written if Python stands still: {exc}"
-            report(lambda: _log.warning(message))
+            report(functools.partial(_log.warning, message))
             return False
         self.path, self._size = path, 0
         return True

@@ -11,6 +11,7 @@ from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.safety import HOOK_TIMEOUT_S
 from horus.loop.stacks import readable_stack, stack_of_thread
+from horus.loop.supervisor_thread import Report
 from horus.spec import Health
 
 _LAST_TICK_MS = 20
@@ -18,9 +19,6 @@ _LAST_TICK_MS = 20
 
 _LOOP_TIMEOUT_S = 0.02
 """How long the event loop may take to begin an async hook [s]."""
-
-Report = Callable[[Callable[[], None]], None]
-"""Writes to the log from a place where that may take as long as it likes."""
 
 
 class HookCaller:

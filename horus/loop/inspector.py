@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 from horus.clock import NEVER
 from horus.live import LiveNode
-from horus.loop.hooks import Report
 from horus.loop.safety import Safety
 from horus.loop.stacks import Stack, readable_stack
+from horus.loop.supervisor_thread import Report
 from horus.loop.watchdog import Finding, Watchdog
 from horus.spec import Health
 from horus.units import readable
@@ -75,12 +75,11 @@ class Inspector:
         news = health is not before or health is Health.HEALTHY
         # First: isolation cuts async ticks short, and then they are nowhere.
         stack = finding.home.stack(live)
-        isolated = False
-        if health is Health.ISOLATED:
+        isolated = health is Health.ISOLATED
+        if isolated:
             if not self._safety.isolate(live, finding.ticks):
                 return
             finding.home.isolate(live)
-            isolated = True
         elif health is not before:
             live.expire(health)
         entered = False

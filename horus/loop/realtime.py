@@ -255,7 +255,7 @@ def _memory_locked(real_time: RealTime) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _garbage_frozen() -> Iterator[None]:
-    """Leave garbage to `supervisor.collect_garbage` while any run wants it.
+    """Leave garbage to supervision while any run wants it.
 
     An automatic collection stops all threads for milliseconds in a program with
     many objects. What exists at the start is frozen: it is looked at no more.

@@ -13,7 +13,6 @@ from typing import Any
 
 from horus import os_rt
 from horus.clock import FOREVER_NS, Timeline
-from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.ending import Ending, WayOut
 from horus.loop.fault_log import FaultLog
@@ -64,7 +63,6 @@ class Supervisor:
         self._timeline = timeline
         self._real_time = real_time
         self._safety = safety
-        self._members = members
         self._fault_log = fault_log
         self._patience_s = to_s(spec.shutdown_timeout_ns)
         self._thread = SupervisorThread(spec.name, real_time.enter_supervisor_thread)
@@ -138,18 +136,15 @@ class Supervisor:
             alarm.cancel()
 
     async def _check_pace(self) -> None:
-        pace = Pace(self._lives)
+        pace = Pace(self._watchdog.watched)
         while True:
             for slow in pace.look(self._timeline.now_ns()):
                 self.report(slow.log)
             await asyncio.sleep(1.0)
 
     def _is_well(self) -> bool:
-        critical = (live for live in self._lives() if live.critical_ns is not None)
+        critical = (live for live in self._watchdog.watched() if live.critical_ns is not None)
         return not self._safety.active and all(live.health is Health.HEALTHY for live in critical)
-
-    def _lives(self) -> list[LiveNode]:
-        return [live for live, _ in self._members()]
 
 
 async def _collect_garbage() -> None:

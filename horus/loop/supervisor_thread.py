@@ -14,6 +14,9 @@ from horus.loop.daemon_pool import DaemonPool
 
 _log = logging.getLogger("horus.supervisor")
 
+Report = Callable[[Callable[[], None]], None]
+"""Writes to the log from a place where that may take as long as it likes."""
+
 _LAST_REPORTS_S = 1.0
 """How long the log may take to accept the last reports [s]."""
 

@@ -62,7 +62,7 @@ class Watchdog:
       counted, and the tick has half a timeout more to end. For a critical node it is.
     - A tick that ends makes a node healthy again, unless it is isolated.
 
-    Thread: one; `require` any.
+    Thread: one, except `watched`, `timeout_of` and `shortest_ns`: any.
     """
 
     def __init__(self, default_ns: int, members: Members) -> None:
