@@ -44,12 +44,22 @@ class Control(Protocol):
     def count_miss(self) -> None:
         """Take note that a deadline was missed."""
 
+    def critical_late(self, live: LiveNode, lasted_ns: int) -> None:
+        """Take note that a critical node got no tick within its limit, unseen by supervision.
+
+        Args:
+            live: The node.
+            lasted_ns: Since it was owed one [ns].
+        """
+
 
 class Limits(NamedTuple):
     """What a tick is measured against; replaced as a whole, read once per tick."""
 
     budget_ns: int
     deadline_ns: int
+    latest_ns: int
+    """The deadline, or the timeout of a critical node if that is shorter."""
 
 
 class Admission(Enum):
@@ -180,15 +190,22 @@ class LiveNode:
         """Take over a configuration: rate and limits hold from the next tick on."""
         self.spec = spec
         self.period_ns = spec.period_ns
+        deadline_ns = NO_LIMIT_NS if spec.deadline_ns is None else spec.deadline_ns
         self.limits = Limits(
             NO_LIMIT_NS if spec.budget_ns is None else spec.budget_ns,
-            NO_LIMIT_NS if spec.deadline_ns is None else spec.deadline_ns,
+            deadline_ns,
+            deadline_ns if self.critical_ns is None else min(deadline_ns, self.critical_ns),
         )
         context = self.tick_context
         context.budget_ns = spec.budget_ns
         context.nominal_dt_s = 1.0 / spec.rate_hz
         if self.timeline.deterministic and spec.execution_class is not ExecutionClass.EVENT:
             context.fixed_dt_s = context.nominal_dt_s
+
+    def make_critical(self, timeout_ns: int) -> None:
+        """Put the system in its safe state when a tick takes longer than this [ns]."""
+        self.critical_ns = timeout_ns
+        self.apply(self.spec)
 
     def grid(self) -> ReleaseGrid:
         """Return the node's release grid: every node counts from the same epoch."""
@@ -425,6 +442,30 @@ class LiveNode:
         since_ns = self.busy_since_ns
         return since_ns != clock.NEVER and self.timeline.now_ns() - since_ns > limit_ns
 
+    def check_critical(self, since_ns: int, now_ns: int) -> None:
+        """Tell supervision of a critical node that got no tick for too long, if it has not seen it.
+
+        Args:
+            since_ns: The release that was served, or skipped, only now [ns]. What waited
+                behind another tick of the node was not owed before that one's end.
+            now_ns: Now [ns].
+
+        Thread: that which ticks the node, or releases it.
+        """
+        if self.critical_ns is None or self.held or self.health is not Health.HEALTHY:
+            return
+        lasted_ns = now_ns - max(since_ns, self.tick_context.finish_ns, self.owed_from_ns)
+        if lasted_ns > self.critical_ns:
+            self.control.critical_late(self, lasted_ns)
+
+    def skip_late(self, count: int, since_ns: int, now_ns: int) -> None:
+        """Count releases that have passed because nothing ran, the first at `since_ns` [ns].
+
+        Thread: that which releases the node.
+        """
+        self.counters.skipped += count
+        self.check_critical(since_ns, now_ns)
+
     def expire(self, health: Health) -> None:
         """Take note that the watchdog has run out.
 
@@ -438,6 +479,14 @@ class LiveNode:
             self.counters.watchdog_expirations += 1
         self.health = health
         self.alert = True
+
+    def expired_unseen(self) -> None:
+        """Take note that the watchdog would have run out, had anybody looked.
+
+        Thread: supervisor.
+        """
+        with self._claims:
+            self.counters.watchdog_expirations += 1
 
     def recovered(self) -> bool:
         """Return to health, because the tick has ended; return whether that is news.
@@ -533,6 +582,9 @@ class _Nobody:
         pass
 
     def count_miss(self) -> None:
+        pass
+
+    def critical_late(self, live: LiveNode, lasted_ns: int) -> None:
         pass
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import logging.handlers
+import os
 import queue
 import sys
 import threading
@@ -66,17 +67,40 @@ class _BoundedHandler(logging.handlers.QueueHandler):
 
 
 class _Writer(threading.Thread):
-    """Writes records to stderr. A daemon: stderr may block for ever."""
+    """Writes records to stderr. A daemon: stderr may block for ever.
+
+    The process must be able to exit meanwhile. So there is no `logging.StreamHandler`,
+    whose lock the exit waits for, and the process's own stderr is written to by its
+    descriptor: its buffer is flushed at exit, and has a lock, too.
+    """
 
     def __init__(self) -> None:
         super().__init__(name="horus-log", daemon=True)
         self.records: queue.SimpleQueue[logging.LogRecord | None] = queue.SimpleQueue()
-        self._screen = logging.StreamHandler(sys.stderr)
-        self._screen.setFormatter(_Formatter())
+        self._format = _Formatter().format
 
     def run(self) -> None:
         while (record := self.records.get()) is not None:
-            self._screen.handle(record)
+            # Gone, closed, or a full disk: there is nobody left to tell.
+            with contextlib.suppress(OSError, ValueError):
+                self._write(self._readable(record) + "\n")
+
+    def _readable(self, record: logging.LogRecord) -> str:
+        try:
+            return self._format(record)
+        except Exception as exc:  # a message and its arguments that do not go together
+            return f"{record.levelname} {record.name}: {record.msg!r} cannot be formatted: {exc!r}"
+
+    @staticmethod
+    def _write(text: str) -> None:
+        stream, own = sys.stderr, sys.__stderr__
+        if own is not None and stream is own:
+            rest = text.encode(own.encoding, "backslashreplace")
+            while rest:
+                rest = rest[os.write(own.fileno(), rest) :]
+        elif stream is not None:  # as it is in a program without a console
+            stream.write(text)
+            stream.flush()
 
     def finish(self) -> None:
         """Let the last records be written, for as long as that may take."""

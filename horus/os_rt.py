@@ -117,6 +117,17 @@ def run_ordinarily(niceness: int) -> None:
     os.setpriority(os.PRIO_PROCESS, 0, niceness)
 
 
+def demote(thread: int) -> None:
+    """Give another thread of this process ordinary scheduling, by its native id.
+
+    Raises:
+        OSError: It has ended, or not on this platform.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        raise OSError("per-thread priorities are not available on this platform")
+    os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+
+
 def affinity() -> set[int]:
     """Return the cores that the calling thread may run on."""
     if not hasattr(os, "sched_getaffinity"):

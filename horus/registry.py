@@ -60,7 +60,7 @@ class Registry:
         """Get every node ready for `init()`: a session opens."""
         with self._lock:
             for name, live in self._by_name.items():
-                if live.abandoned:
+                if live.abandoned or not live.hook_returned.is_set():
                     self._by_name[name] = live.successor()
                 else:
                     live.renew()

@@ -178,8 +178,8 @@ class Scheduler:
             ConfigError: The timeout is refused.
         """
         live = self._registry.get(name)
-        live.critical_ns = check_duration("timeout_ms", timeout_ms, "milliseconds")
-        self._session.watch(live)
+        live.make_critical(check_duration("timeout_ms", timeout_ms, "milliseconds"))
+        self._session.oversight.watch(live)
 
     def clear_safe_state(self) -> list[str]:
         """Let the nodes tick again that the safe state or their isolation has taken out.
@@ -190,8 +190,11 @@ class Scheduler:
 
         Raises:
             StateError: A critical node is still frozen; nothing has changed.
+
+        Thread: any, but not a signal handler: it takes locks, and waits up to 0.1 s for
+        each hook that is just being called.
         """
-        return self._session.clear_safe_state()
+        return self._session.oversight.clear_safe_state()
 
     # -- running -------------------------------------------------------------------
 
@@ -211,9 +214,11 @@ class Scheduler:
         duration_ns = optional_duration("duration", duration)
         _refuse_in_event_loop("run", "await sched.arun()")
         self._session.run(duration_ns)
-        if self._spec.verbose:
-            print(self.timing_report())
-        self._session.raise_failure()
+        try:
+            if self._spec.verbose:
+                print(self.timing_report())
+        finally:  # stdout may be closed
+            self._session.raise_failure()
 
     async def arun(self, duration: float | None = None) -> None:
         """Run the nodes on the running event loop, beside the application's own tasks.
@@ -409,8 +414,8 @@ class Scheduler:
     def safety_stats(self) -> dict[str, Any]:
         """Return the sums of what went wrong, each node's health, and the safe state's reason."""
         stats = self._registry.safety_stats()
-        stats["safe_state"] = self._session.safety.active
-        stats["safe_state_reason"] = self._session.safety.reason
+        stats["safe_state"] = self._session.oversight.safety.active
+        stats["safe_state_reason"] = self._session.oversight.safety.reason
         return stats
 
     @property
@@ -422,7 +427,7 @@ class Scheduler:
         computes without releasing the interpreter. None while there is no such file;
         it goes away after the run if nothing was written to it.
         """
-        return self._session.fault_log.path
+        return self._session.oversight.fault_log.path
 
     def capabilities(self) -> dict[str, Any]:
         """Return what real-time features this process may have, and facts about the machine.
@@ -439,7 +444,7 @@ class Scheduler:
 
     def degradations(self) -> list[str]:
         """Return what was requested and refused, in readable sentences."""
-        return self._session.real_time.degradations()
+        return self._session.oversight.real_time.degradations()
 
     # -- recording: the contract's names, refused until there is something behind them --
 

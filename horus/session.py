@@ -5,32 +5,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 from horus import clock, logs
 from horus.clock import MonotonicClock, SimClock, Timeline
+from horus.drivers import Drivers
 from horus.errors import NodeError, ShutdownTimeout, StateError
 from horus.executors import make_executors
 from horus.live import LiveNode
-from horus.loop.bridge import Bridge
 from horus.loop.control import RunControl
-from horus.loop.executor import Home
-from horus.loop.fault_log import FaultLog
-from horus.loop.hooks import HookCaller
-from horus.loop.inspector import Inspector
-from horus.loop.notify import Notifier, find_notifier
 from horus.loop.private_loop import StepLoop
-from horus.loop.realtime import RealTime
 from horus.loop.runtime import Runtime, uninterrupted
-from horus.loop.safety import Safety
-from horus.loop.signals import SignalOwner
 from horus.loop.simulation import Simulation
-from horus.loop.stacks import in_callback
 from horus.loop.stepping import Stepper
-from horus.loop.supervisor import Supervisor
-from horus.loop.watchdog import Watchdog
+from horus.oversight import Oversight
 from horus.registry import Registry
-from horus.spec import NodeState, SchedulerSpec
+from horus.spec import SchedulerSpec
 from horus.stream import MessageStream
 from horus.topics import Bus, Subscription
 from horus.units import to_s
@@ -64,26 +54,17 @@ class Session:
             seed=spec.seed if spec.deterministic else None,
         )
         self.registry = Registry(self.bus, self.timeline)
-        self.control = RunControl(spec.max_deadline_misses)
-        self.real_time = RealTime(spec)
-        self.safety = Safety(self._call_hooks)
+        self._drivers = Drivers()
+        self.oversight = Oversight(spec, self.timeline, self.registry, self._drivers)
+        self.control = RunControl(spec.max_deadline_misses, self.oversight.critical_late)
         self.status = "idle"
         self._lock = threading.Lock()
         self._open = False
         self._closing = False
-        self._stepping = False
         self._idle = threading.Event()
         self._idle.set()
         self._driving_thread: int | None = None
         self._loop: StepLoop | None = None
-        self._runtime: Runtime | None = None
-        self._stepper: Stepper | None = None
-        self._supervisor: Supervisor | None = None
-        self._hooks = HookCaller(self.real_time.enter_hook_thread, self._bridge, self._report)
-        self._signals: SignalOwner | None = None
-        self._notifier: Notifier | None = None
-        self.fault_log = FaultLog(spec.name)
-        self._watched = spec.watchdog_ns > 0
         self._streams: set[MessageStream] = set()
 
     @property
@@ -142,18 +123,17 @@ class Session:
             finally:
                 self.control.end()
                 await runtime.close()
-                self._runtime = None
+                self._drivers.runtime = None
 
     def step(self, only: list[LiveNode] | None) -> None:
         """Run one cycle on the calling thread; the nodes stay initialised."""
         self._take_charge()
-        self._stepping = True
-        if self._watched and not self._spec.deterministic:
-            self._supervise().start()
+        self._drivers.stepping = True
+        self.oversight.begin_steps()
         try:
             self._open_stepper().cycle(only)
         finally:
-            self._stepping = False
+            self._drivers.stepping = False
             self._hand_back(keeps_open=True)
 
     def stop(self, reason: str) -> None:
@@ -190,33 +170,16 @@ class Session:
 
     def joined(self, live: LiveNode) -> None:
         """Let a node that was added take part: now, or from the next run or step on."""
-        self.watch(live)
-        runtime, stepper = self._runtime, self._stepper
+        self.oversight.watch(live)
+        runtime, stepper = self._drivers.runtime, self._drivers.stepper
         if self.running and runtime is not None:
             runtime.add(live)
         elif self.running and stepper is not None:
             stepper.add(live)
 
-    def watch(self, live: LiveNode) -> None:
-        """Take note of a node's watchdog timeout, which is new or has changed."""
-        if live.spec.watchdog_ns or live.critical_ns:
-            self._watched = True
-            if self._supervisor is not None:
-                self._supervisor.look_again()
-            if isinstance(self._stepper, Simulation):
-                self._stepper.look_again()
-
-    def clear_safe_state(self) -> list[str]:
-        """Let the nodes tick again that are held; return the names of those that cannot yet.
-
-        Raises:
-            StateError: A critical node is still frozen.
-        """
-        return self.safety.clear(self.registry.in_order)
-
     def retimed(self, live: LiveNode) -> None:
         """Adopt a node's changed rate."""
-        for driver in (self._runtime, self._stepper):
+        for driver in (self._drivers.runtime, self._drivers.stepper):
             if driver is not None:
                 driver.retime(live)
 
@@ -227,9 +190,9 @@ class Session:
             ShutdownTimeout: Its tick or its `shutdown()` did not end in time.
         """
         live.removed = True
-        runtime, stepper = self._runtime, self._stepper
+        runtime, stepper = self._drivers.runtime, self._drivers.stepper
         # While a step is taken, a runtime stands still, and the stepper sees to it.
-        if runtime is not None and not (self.running and self._stepping):
+        if runtime is not None and not (self.running and self._drivers.stepping):
             self._wait_for(live, runtime)
         if stepper is not None:
             stepper.remove(live)
@@ -254,31 +217,13 @@ class Session:
             around.callback(self._become_idle)
             around.enter_context(logs.visible(install=owns_process, verbose=self._spec.verbose))
             if owns_process:
-                self._signals = SignalOwner(self.control.request_stop, self._last_act, in_callback)
-                around.enter_context(self._signals.owning())
-                self._notifier = find_notifier()
-                around.callback(self._forget_process)
+                around.enter_context(self.oversight.owning_process(self.control.request_stop))
             around.callback(self._hand_back, keeps_open=keeps_open)
             try:
                 yield
             except KeyboardInterrupt:
                 self.control.request_stop("KeyboardInterrupt")
                 raise
-
-    def _forget_process(self) -> None:
-        self._signals = None
-        if self._notifier is not None:
-            self._notifier.close()
-            self._notifier = None
-
-    def _last_act(self) -> None:
-        """Make the robot safe before the process is forced to end."""
-        alive = (NodeState.RUNNING, NodeState.RESTARTING, NodeState.STOPPING)
-        self._hooks.call(
-            live
-            for live in reversed(self.registry.in_order)
-            if live.state in alive and live.hold() and live.claim_hook()
-        )
 
     def _become_idle(self) -> None:
         self._driving_thread = None
@@ -296,20 +241,20 @@ class Session:
                     f"scheduler {self._spec.name!r} is already running; "
                     "stop it first, or use a second scheduler"
                 )
-            if self._runtime is not None:
-                self._runtime.rearm()
+            if self._drivers.runtime is not None:
+                self._drivers.runtime.rearm()
             # Before the status tells anybody: a stop that comes now must count.
             self.control.begin(self._end_run)
             self.status = "running"
         if not self._open:
             self._open = True
-            self.safety.reset()
+            self.oversight.safety.reset()
             self.registry.renew()
 
     def _hand_back(self, *, keeps_open: bool) -> None:
         """Let others run the nodes; unless they stay initialised, they are shut down."""
         self.control.end()
-        self._tell_manager("STOPPING=1")
+        self.oversight.tell_manager("STOPPING=1")
         try:
             if not keeps_open or self.control.failure is not None:
                 self._close()
@@ -322,17 +267,15 @@ class Session:
             return
         self._open = False
         try:
-            if self._runtime is not None:
-                self._private_loop().run(self._runtime.close())
+            if self._drivers.runtime is not None:
+                self._private_loop().run(self._drivers.runtime.close())
         finally:
-            self._runtime = None
-            stepper = self._stepper or self._make_stepper()
-            self._stepper = None
+            self._drivers.runtime = None
+            stepper = self._drivers.stepper or self._make_stepper()
+            self._drivers.stepper = None
             stepper.shut_down(self.registry.in_order)
             stepper.close()
-            if self._supervisor is not None:
-                self._supervisor.close()
-                self._supervisor = None
+            self.oversight.close()
             if self._loop is not None:
                 self._loop.close()
                 self._loop = None
@@ -351,83 +294,39 @@ class Session:
         return self._loop
 
     def _start_runtime(self) -> Runtime:
-        if self._runtime is None:
-            self._runtime = Runtime(
+        runtime = self._drivers.runtime
+        if runtime is None:
+            runtime = self._drivers.runtime = Runtime(
                 self.timeline,
-                self.real_time,
-                self._supervise(),
-                self.safety,
+                self.oversight.real_time,
+                self.oversight.supervisor(),
+                self.oversight.safety,
                 make_executors,
                 self._spec.shutdown_timeout_ns,
             )
-        if self._notifier is not None and self._notifier.watchdog_s is not None:
-            self._supervise().notify(self._notifier)
-        signals = self._signals
-        self._runtime.way_out = signals if signals and signals.owns else None
+        self.oversight.keep_manager_informed()
+        runtime.way_out = self.oversight.way_out
         if self.control.stopping:
-            self._runtime.request_stop()
-        return self._runtime
+            runtime.request_stop()
+        return runtime
 
     def _open_stepper(self) -> Stepper:
-        if self._stepper is None:
-            self._stepper = self._make_stepper()
-        if self._stepper.take_on(self.registry.in_order) and self._supervisor is not None:
-            self._supervisor.look_again()
-        return self._stepper
+        stepper = self._drivers.stepper
+        if stepper is None:
+            stepper = self._drivers.stepper = self._make_stepper()
+        if stepper.take_on(self.registry.in_order):
+            self.oversight.look_again()
+        return stepper
 
     def _make_stepper(self) -> Stepper:
+        safety = self.oversight.safety
         if self._sim_clock is None:
-            return Stepper(self.timeline, self._private_loop, self._stopping, self.safety)
-        watchdog = Watchdog(self._spec.watchdog_ns, self._members)
-        inspector = Inspector(watchdog, self.safety, self.timeline.now_ns, self._report)
-        return Simulation(self.timeline, self._sim_clock, self._stopping, self.safety, inspector)
-
-    def _members(self) -> Sequence[tuple[LiveNode, Home]]:
-        """Return the nodes that are run, each with its home. Thread: any."""
-        runtime, stepper = self._runtime, self._stepper
-        if runtime is not None and not self._stepping:
-            return runtime.members()
-        return () if stepper is None else stepper.members()
-
-    def _supervise(self) -> Supervisor:
-        """Return the supervisor of this session, which still has to be started."""
-        if self._supervisor is None:
-            self._supervisor = Supervisor(
-                self._spec,
-                self.timeline,
-                self.real_time,
-                self.safety,
-                self._members,
-                self.fault_log,
-            )
-        return self._supervisor
-
-    def _report(self, write: Callable[[], None]) -> None:
-        """Log something, where that may take as long as it likes. Thread: any."""
-        supervisor = self._supervisor
-        if supervisor is None:
-            write()
-        else:
-            supervisor.report(write)
+            return Stepper(self.timeline, self._private_loop, self._stopping, safety)
+        inspector = self.oversight.inspector()
+        return Simulation(self.timeline, self._sim_clock, self._stopping, safety, inspector)
 
     def _ready(self) -> None:
-        self._tell_manager("READY=1")
-
-    def _tell_manager(self, state: str) -> None:
-        notifier = self._notifier
-        if notifier is not None:
-            notifier.send(state)
-
-    def _bridge(self) -> Bridge | None:
-        runtime = self._runtime
-        return None if runtime is None else runtime.bridge
-
-    def _call_hooks(self, lives: Sequence[LiveNode]) -> None:
-        stepper = self._stepper
-        if isinstance(stepper, Simulation):
-            stepper.call_hooks(lives)
-        else:
-            self._hooks.start(lives)
+        self.oversight.tell_manager("READY=1")
 
     def _simulate(self, duration_ns: int | None, only: list[LiveNode] | None) -> None:
         """Run in virtual time on the calling thread."""
@@ -474,8 +373,8 @@ class Session:
             raise ShutdownTimeout(live.name, timeout_s) from None
 
     def _end_run(self) -> None:
-        self._tell_manager("STOPPING=1")
-        runtime = self._runtime
+        self.oversight.tell_manager("STOPPING=1")
+        runtime = self._drivers.runtime
         if runtime is not None:
             runtime.request_stop()
 

@@ -122,7 +122,7 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException |
     add_times = counters.times.add
 
     def finish(release_ns: int, start_ns: int, limits: Limits, error: BaseException | None) -> bool:
-        context.finish_ns = finish_ns = now_ns()
+        finish_ns = now_ns()
         execution_ns = finish_ns - start_ns
         counters.ticks += 1
         if counters.first_release_ns is None:
@@ -130,9 +130,14 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException |
         counters.last_release_ns = release_ns
         add_times(execution_ns, start_ns - release_ns)
         over_budget_ns = execution_ns - limits[0]
-        past_deadline_ns = finish_ns - release_ns - limits[1]
-        if over_budget_ns > 0 or past_deadline_ns > 0 or error is not None or live.alert:
-            return _settle(live, limits, over_budget_ns, past_deadline_ns, error)
+        if (
+            over_budget_ns > 0
+            or finish_ns - release_ns > limits[2]
+            or error is not None
+            or live.alert
+        ):
+            return _settle(live, release_ns, finish_ns, limits, over_budget_ns, error)
+        context.finish_ns = finish_ns
         context.ticking = False
         return False
 
@@ -141,9 +146,10 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException |
 
 def _settle(
     live: LiveNode,
+    release_ns: int,
+    finish_ns: int,
     limits: Limits,
     over_budget_ns: int,
-    past_deadline_ns: int,
     error: BaseException | None,
 ) -> bool:
     """Count what went wrong, decide what follows and do it; see `_build_finish`.
@@ -152,9 +158,13 @@ def _settle(
     """
     context = live.tick_context
     if live.abandoned:
+        context.finish_ns = finish_ns
         context.ticking = False
         return False  # it was shut down without us: nothing may follow
+    live.check_critical(release_ns, finish_ns)
+    context.finish_ns = finish_ns
     counters = live.counters
+    past_deadline_ns = finish_ns - release_ns - limits.deadline_ns
     outcome = Outcome(max(0, over_budget_ns), max(0, past_deadline_ns), error is not None)
     action = decide(
         outcome,

@@ -60,12 +60,13 @@ class ComputeExecutor(ThreadExecutor[ComputeThread]):
 
     def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
         """Return the release that waits for the worker, or for the loop to hand it on."""
-        posted_ns = self.thread_of(live).posted_ns
+        thread = self.find_thread(live)
+        posted_ns = None if thread is None else thread.posted_ns
         return self._cycle.due_ns(live, now_ns) if posted_ns is None else posted_ns
 
     def thread_id(self, live: LiveNode) -> int | None:
         """Return the worker's thread, or the loop's while that has nothing handed on."""
-        thread = self._threads.get(live)
+        thread = self.find_thread(live)
         if thread is not None and thread.posted_ns is None:
             return self._bridge.thread_id
         return super().thread_id(live)

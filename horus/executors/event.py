@@ -193,7 +193,8 @@ class ThreadEventExecutor(ThreadExecutor[EventThread]):
 
     def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
         """Return the arrival of the message whose tick has not begun."""
-        return self.thread_of(live).arrivals.due_ns()
+        thread = self.find_thread(live)
+        return None if thread is None else thread.arrivals.due_ns()
 
     def retime(self, live: LiveNode) -> None:
         """Do nothing: messages release the node."""

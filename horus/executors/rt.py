@@ -131,7 +131,7 @@ class RtThread(NodeThread):
         self._pass_baton(self._release_ns - 1)
 
     def _skip_to(self, index: int) -> None:
-        self.live.counters.skipped += index - self._index
+        self.live.skip_late(index - self._index, self._release_ns, self._now_ns())
         self._move_to(index)
 
     def _move_to(self, index: int) -> None:
@@ -214,10 +214,17 @@ class RtThread(NodeThread):
             self.live.order_violated(predecessor.live)
 
     def _pass_baton(self, done_ns: int) -> None:
-        """Let those run that wait for this node."""
+        """Let those run that wait for this node.
+
+        Thread: the node's, or supervision.
+        """
         self.done_ns = done_ns
         while self._waiting:
-            self._waiting.popleft().unpark()
+            try:
+                waiting = self._waiting.popleft()
+            except IndexError:  # the other one has taken it
+                return
+            waiting.unpark()
 
 
 class RtExecutor(ThreadExecutor[RtThread]):
@@ -253,11 +260,14 @@ class RtExecutor(ThreadExecutor[RtThread]):
 
     def due_ns(self, live: LiveNode, now_ns: int) -> int | None:
         """Return the release whose tick has not begun."""
-        return self.thread_of(live).due_ns(now_ns)
+        thread = self.find_thread(live)
+        return None if thread is None else thread.due_ns(now_ns)
 
     def isolate(self, live: LiveNode) -> None:
         """Let nobody wait for a baton that does not come."""
-        self.thread_of(live)._pass_baton(clock.FOREVER_NS)
+        thread = self.find_thread(live)
+        if thread is not None:
+            thread._pass_baton(clock.FOREVER_NS)
 
     def retime(self, live: LiveNode) -> None:
         """Let the thread move to the grid of the new rate."""

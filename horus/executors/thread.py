@@ -106,6 +106,13 @@ class ThreadExecutor(ABC, Generic[T]):
         """Return the node's thread."""
         return self._threads[live]
 
+    def find_thread(self, live: LiveNode) -> T | None:
+        """Return the node's thread; None if it has just been dismissed.
+
+        Thread: any.
+        """
+        return self._threads.get(live)
+
     def adopt(self, live: LiveNode) -> None:
         """Start the node's thread; it does nothing yet."""
         thread = self._threads[live] = self.make_thread(live)
@@ -120,7 +127,7 @@ class ThreadExecutor(ABC, Generic[T]):
 
     def thread_id(self, live: LiveNode) -> int | None:
         """Return the node's thread."""
-        thread = self._threads.get(live)
+        thread = self.find_thread(live)
         return None if thread is None else thread.ident
 
     def computes(self, live: LiveNode) -> bool:

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 
 from horus.errors import NodeError
+from horus.live import LiveNode
 
 _log = logging.getLogger("horus.scheduler")
 
@@ -19,9 +20,12 @@ class RunControl:
     Thread: any.
     """
 
-    def __init__(self, max_deadline_misses: int | None) -> None:
-        """Watch over the runs of a scheduler."""
+    def __init__(
+        self, max_deadline_misses: int | None, critical_late: Callable[[LiveNode, int], None]
+    ) -> None:
+        """Watch over the runs of a scheduler; `critical_late` is told of critical nodes."""
         self._max_deadline_misses = max_deadline_misses
+        self.critical_late = critical_late
         self._lock = threading.Lock()
         self._misses = 0
         self._on_stop: Callable[[], None] | None = None

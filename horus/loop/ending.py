@@ -15,7 +15,7 @@ from horus.units import to_s
 
 _log = logging.getLogger("horus.supervisor")
 
-_INTERRUPT_AGAIN_S = 0.1
+_TRY_AGAIN_S = 0.1
 
 
 class WayOut(Protocol):
@@ -23,6 +23,9 @@ class WayOut(Protocol):
 
     Thread: any other.
     """
+
+    interrupted: bool
+    """Whether the last `interrupt` has reached the callback."""
 
     def interrupt(self) -> None:
         """Raise an exception in the callback, if it executes Python code."""
@@ -86,7 +89,7 @@ class Ending:
             self._bridge.post(functools.partial(self._supervisor.call, answered.set))
             if not await _within(self._patience_s, answered) and not await _within(
                 # Once more: a process that was suspended has had no chance.
-                _INTERRUPT_AGAIN_S,
+                _TRY_AGAIN_S,
                 answered,
             ):
                 self._stop()
@@ -96,11 +99,16 @@ class Ending:
             await asyncio.sleep(self._patience_s / 2)
 
     async def _take(self, way_out: WayOut, answered: asyncio.Event) -> None:
-        """Interrupt until the loop answers; in the end, force the process to exit."""
-        for _ in range(max(1, round(self._patience_s / _INTERRUPT_AGAIN_S))):
-            way_out.interrupt()
-            if await _within(_INTERRUPT_AGAIN_S, answered) or self._over:
+        """Interrupt the callback, once; if the loop gives no answer, force the process to exit.
+
+        Interrupted again, it could not even clean up.
+        """
+        way_out.interrupt()
+        for _ in range(max(1, round(self._patience_s / _TRY_AGAIN_S))):
+            if await _within(_TRY_AGAIN_S, answered) or self._over:
                 return
+            if not way_out.interrupted:
+                way_out.interrupt()
         way_out.force_exit("the event loop does not come back")
 
     def _report(self) -> None:

@@ -42,8 +42,6 @@ class FaultLog:
     def __init__(self, scheduler: str) -> None:
         """Prepare; the file of the scheduler of this name is created when it is needed."""
         self._name = f"{scheduler}-{os.getpid()}.stacks"
-        self._file: IO[bytes] | None = None
-        self._size = 0
         self.path: Path | None = None
         """The file; None if there is none. It stays if something was written to it."""
 
@@ -55,53 +53,50 @@ class FaultLog:
                 after a standstill of two of these, and of 1 s at least.
             report: Takes what is to be logged.
         """
-        try:
-            while self._open(report):
-                delay_ns = min(max(2 * timeout_ns(), _SHORTEST_DELAY_NS), _LONGEST_DELAY_NS)
-                assert self._file is not None
-                # Each call ends the timer's thread and starts another: rarely, then.
-                faulthandler.dump_traceback_later(to_s(delay_ns), file=self._file)
-                await asyncio.sleep(to_s(delay_ns) / 2)
-                size = os.fstat(self._file.fileno()).st_size
-                if size > self._size:
-                    self._size = size
-                    message = (
-                        f"Python stood still for more than {readable(delay_ns)}; "
-                        f"the stacks of all threads are in {self.path}"
-                    )
-                    report(functools.partial(_log.critical, message))
-        finally:
-            self._close()
-
-    def _open(self, report: Report) -> bool:
-        """Open the file, once; return whether there is one."""
-        if self._file is not None:
-            return True
-        if not _owned.acquire(blocking=False):
-            return False
+        while not _owned.acquire(blocking=False):  # noqa: ASYNC110  (a lock of the process)
+            # Another scheduler of this process has the timer. When its run is over, it is ours.
+            await asyncio.sleep(to_s(_SHORTEST_DELAY_NS))
         try:
             path = _directory() / self._name
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("wb", buffering=0)
+            with path.open("wb", buffering=0) as file:
+                self.path = path
+                try:
+                    await self._put_off(file, timeout_ns, report)
+                finally:
+                    faulthandler.cancel_dump_traceback_later()
+                    if _size(file) == 0:
+                        path.unlink(missing_ok=True)
+                        self.path = None
         except OSError as exc:
-            _owned.release()
             message = f"no stacks will be written if Python stands still: {exc}"
             report(functools.partial(_log.warning, message))
-            return False
-        self.path, self._size = path, 0
-        return True
+        finally:
+            _owned.release()
 
-    def _close(self) -> None:
-        if self._file is None or self.path is None:
-            return
-        faulthandler.cancel_dump_traceback_later()
-        self._size = os.fstat(self._file.fileno()).st_size
-        self._file.close()
-        self._file = None
-        _owned.release()
-        if self._size == 0:
-            self.path.unlink(missing_ok=True)
-            self.path = None
+    async def _put_off(
+        self, file: IO[bytes], timeout_ns: Callable[[], int], report: Report
+    ) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            delay_ns = min(max(2 * timeout_ns(), _SHORTEST_DELAY_NS), _LONGEST_DELAY_NS)
+            size, began_s = _size(file), loop.time()
+            # Each call ends the timer's thread and starts another: rarely, then.
+            faulthandler.dump_traceback_later(to_s(delay_ns), file=file)
+            await asyncio.sleep(to_s(delay_ns) / 2)
+            written = _size(file) > size
+            # On a full disk only our own lateness tells.
+            if written or loop.time() - began_s > to_s(delay_ns):
+                where = f"are in {self.path}" if written else f"could not be written to {self.path}"
+                message = (
+                    f"Python stood still for more than {readable(delay_ns)}; "
+                    f"the stacks of all threads {where}"
+                )
+                report(functools.partial(_log.critical, message))
+
+
+def _size(file: IO[bytes]) -> int:
+    return os.fstat(file.fileno()).st_size
 
 
 def _directory() -> Path:

@@ -67,6 +67,21 @@ class Inspector:
         for finding in self._watchdog.look(self._now_ns()):
             self._act(finding)
 
+    def critical_late(self, live: LiveNode, lasted_ns: int) -> None:
+        """Act on a critical node that was owed a tick for too long [ns] before anybody looked.
+
+        Because the whole process stood still, say: the motor was not controlled either.
+        """
+        if live.critical_ns is None:
+            return
+        live.expired_unseen()
+        reason = (
+            f"critical node {live.name} was owed a tick for {readable(lasted_ns)}, longer than "
+            f"its limit of {readable(live.critical_ns)}, before anybody could look"
+        )
+        if self._safety.enter(reason, self._watchdog.watched):
+            self._report(functools.partial(_tell_of_entry, reason))
+
     def _act(self, finding: Finding) -> None:
         live, health = finding.live, finding.health
         before = live.health
@@ -82,14 +97,15 @@ class Inspector:
             finding.home.isolate(live)
         elif health is not before:
             live.expire(health)
-        entered = False
+        entered: str | None = None
         if live.critical_ns is not None and (finding.critical or isolated):
             reason = (
                 f"critical node {live.name} {_lasting(finding)}, longer than its limit of "
                 + readable(live.critical_ns if finding.critical else 3 * self._timeout_ns(live))
             )
-            entered = self._safety.enter(reason, self._watchdog.watched)
-        if news or entered:
+            if self._safety.enter(reason, self._watchdog.watched):
+                entered = reason
+        if news or entered is not None:
             self._report(functools.partial(self._tell, finding, health, news, entered, stack))
 
     def _timeout_ns(self, live: LiveNode) -> int:
@@ -103,15 +119,15 @@ class Inspector:
         return f"its watchdog timeout is {readable(timeout_ns)}"
 
     def _tell(
-        self, finding: Finding, health: Health, news: bool, entered: bool, stack: Stack
+        self, finding: Finding, health: Health, news: bool, entered: str | None, stack: Stack
     ) -> None:
         """Log what was done.
 
         Thread: that of the reports.
         """
         live = finding.live
-        if entered:
-            _log.critical("safe state entered: %s", self._safety.reason)
+        if entered is not None:
+            _tell_of_entry(entered)
         if news and health is Health.HEALTHY:
             live.emit(logging.INFO, "healthy again")
         elif news:
@@ -128,6 +144,10 @@ _CONSEQUENCES = {
     Health.UNHEALTHY: "; its releases are skipped",
     Health.ISOLATED: "; it is taken out of the schedule",
 }
+
+
+def _tell_of_entry(reason: str) -> None:
+    _log.critical("safe state entered: %s", reason)
 
 
 def _lasting(finding: Finding) -> str:

@@ -112,8 +112,12 @@ class StepLoop:
         # On a thread that may be left behind: a function handed to a thread can
         # hang, and nothing can end it.
         last = threading.Thread(target=self._workers.shutdown, daemon=True)
-        last.start()
-        last.join(_LAST_STEPS_S)
+        try:
+            last.start()
+        except RuntimeError:  # the process can have no more threads
+            self._workers.shutdown(wait=False)
+        else:
+            last.join(_LAST_STEPS_S)
         self.loop.close()
 
 

@@ -125,6 +125,12 @@ class RealTime:
             with contextlib.suppress(OSError):
                 os_rt.run_fifo(_HOOK_PRIORITY)
 
+    def demote_hook_thread(self, thread: threading.Thread) -> None:
+        """Put a safe-state hook that does not return below every node, on which it may spin."""
+        if self._rt and thread.native_id is not None:
+            with contextlib.suppress(OSError):
+                os_rt.demote(thread.native_id)
+
     @contextlib.contextmanager
     def in_loop_thread(self) -> Iterator[None]:
         """Pin the event loop's thread and make its timers exact, then put both back."""

@@ -105,7 +105,7 @@ class ReleaseQueue:
         following_ns = grid.at(release.index + 1)
         if following_ns <= now_ns:
             latest = grid.index_at(now_ns)
-            release.live.counters.skipped += latest - release.index
+            release.live.skip_late(latest - release.index, release_ns, now_ns)
             release.index = latest
             release_ns, following_ns = grid.at(latest), grid.at(latest + 1)
         release.index += 1

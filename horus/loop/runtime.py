@@ -23,7 +23,14 @@ from horus.loop.executor import Executor, Home
 from horus.loop.gil import prompt_switching
 from horus.loop.realtime import RealTime
 from horus.loop.safety import Safety
-from horus.loop.shutdown import begin_shutdown, quiesce, shut_down
+from horus.loop.shutdown import (
+    begin_shutdown,
+    hook_over,
+    leave_behind,
+    quiesce,
+    shut_down,
+    shut_down_without_loop,
+)
 from horus.loop.supervisor import Supervisor
 from horus.spec import ExecutionClass, NodeState
 from horus.units import NS_PER_MS, to_s
@@ -216,6 +223,15 @@ class Runtime:
         home = self._homes.get(live)
         return home is not None and home.is_home(live)
 
+    def shut_down_without_loop(self) -> None:
+        """Call every `shutdown()` that is owed: the process ends, for the loop is blocked.
+
+        Thread: any other.
+        """
+        shut_down_without_loop(
+            self._homes.copy(), self._shutdown_timeout_ns, self._supervisor.report
+        )
+
     @property
     def bridge(self) -> Bridge | None:
         """The way into the event loop; None before the first play and after the last."""
@@ -349,12 +365,22 @@ class Runtime:
                 removed.set_result(None)
             self._post(lambda: self._dismiss(live))
 
-        def shut_down(_: object) -> None:
-            shutdown = begin_shutdown(live, home)
-            shutdown.add_done_callback(finish)
+        def begin() -> None:
+            begin_shutdown(live, home).add_done_callback(finish)
 
-        def leave_behind() -> None:
+        async def begin_after_hook() -> None:
+            await hook_over(live)
+            begin()
+
+        def shut_down(_: object) -> None:
+            if live.hook_returned.is_set():
+                begin()
+            else:
+                self._post(lambda: self._spawn(begin_after_hook()))
+
+        def give_up() -> None:
             if not free.done():
+                leave_behind(live)
                 begin_shutdown(live, None).add_done_callback(finish)
 
         # Whatever runs in the home comes first, also an init() that has just begun.
@@ -362,7 +388,7 @@ class Runtime:
         # may be what keeps this loop busy.
         free = home.call(live, None)
         free.add_done_callback(shut_down)
-        asyncio.get_running_loop().call_later(to_s(self._shutdown_timeout_ns), leave_behind)
+        asyncio.get_running_loop().call_later(to_s(self._shutdown_timeout_ns), give_up)
 
     def _dismiss(self, live: LiveNode) -> None:
         home = self._homes.pop(live, None)

@@ -94,6 +94,7 @@ class Safety:
         with self._lock:
             # Again: one that froze meanwhile has found the safe state active.
             self._refuse_if_frozen(lives)
+            news = self.active or any(live.held for live in lives)
             self.reason = None
             for live in lives:
                 frozen = live.health is Health.ISOLATED and live.busy
@@ -101,7 +102,9 @@ class Safety:
                     remain.append(live.name)
                 elif live.held:
                     live.free()
-        _log.warning("safe state cleared%s", f"; still held: {', '.join(remain)}" if remain else "")
+        if news:
+            still = f"; still held: {', '.join(remain)}" if remain else ""
+            _log.warning("safe state cleared%s", still)
         return remain
 
     def reset(self) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
+import functools
 import logging
 import threading
 from collections.abc import Collection, Mapping
@@ -11,10 +13,12 @@ from concurrent.futures import Future
 from horus.errors import ShutdownTimeout
 from horus.live import LiveNode
 from horus.loop.executor import Executor
+from horus.loop.safety import HOOK_TIMEOUT_S
+from horus.loop.supervisor_thread import Report
 from horus.units import to_s
 
-_HOOK_PATIENCE_MS = 100
-"""How long `shutdown()` of a node waits for its safe-state hook [ms]."""
+_HOME_PATIENCE_S = 0.1
+"""How long the homes may take to answer when the event loop does not [s]."""
 
 
 async def quiesce(
@@ -54,18 +58,61 @@ async def shut_down(
 
 
 async def _shut_down_one(live: LiveNode, home: Executor | None, timeout_ns: int) -> None:
-    for _ in range(_HOOK_PATIENCE_MS):
-        if live.hook_returned.is_set():
-            break
-        await asyncio.sleep(0.001)
+    await hook_over(live)
+    if home is None:
+        leave_behind(live)
     shutdown = asyncio.wrap_future(begin_shutdown(live, home))
     done, _ = await asyncio.wait([shutdown], timeout=to_s(timeout_ns))
     if not done:
-        live.abandoned = True
-        timeout = ShutdownTimeout(live.name, to_s(timeout_ns))
-        live.emit(logging.ERROR, str(timeout))
-        live.notify_error(timeout)
+        _give_up(live, timeout_ns)
     live.stopped()
+
+
+def shut_down_without_loop(
+    homes: Mapping[LiveNode, Executor], timeout_ns: int, report: Report
+) -> None:
+    """Do what is left of `shut_down` although the event loop does not come back.
+
+    Thread: any other.
+    """
+    waits = {home.call(live, None): live for live, home in homes.items()}
+    _, late = concurrent.futures.wait(waits, _HOME_PATIENCE_S)
+    for wait in late:
+        wait.cancel()
+    stuck = {waits[wait] for wait in late}
+    for live, home in sorted(homes.items(), key=lambda item: item[0].rank, reverse=True):
+        if not live.initialized:
+            continue
+        if live in stuck:
+            report(functools.partial(leave_behind, live))
+        shutdown = begin_shutdown(live, None if live in stuck else home)
+        _, late = concurrent.futures.wait([shutdown], to_s(timeout_ns))
+        if late:
+            report(functools.partial(_give_up, live, timeout_ns))
+
+
+async def hook_over(live: LiveNode) -> None:
+    """Wait for a node's safe-state hook, for as long as others do."""
+    for _ in range(round(HOOK_TIMEOUT_S * 1000)):
+        if live.hook_returned.is_set():
+            return
+        await asyncio.sleep(0.001)
+
+
+def leave_behind(live: LiveNode) -> None:
+    """Let nobody wait any more for a node whose home is stuck."""
+    live.abandoned = True
+    live.emit(
+        logging.ERROR,
+        "its last callback does not end; it is left behind, and shutdown() runs elsewhere",
+    )
+
+
+def _give_up(live: LiveNode, timeout_ns: int) -> None:
+    live.abandoned = True
+    timeout = ShutdownTimeout(live.name, to_s(timeout_ns))
+    live.emit(logging.ERROR, str(timeout))
+    live.notify_error(timeout)
 
 
 def begin_shutdown(live: LiveNode, home: Executor | None) -> Future[bool]:
@@ -73,12 +120,6 @@ def begin_shutdown(live: LiveNode, home: Executor | None) -> Future[bool]:
 
     Thread: any; the node sees to it that only one caller gets through.
     """
-    if home is None:
-        live.abandoned = True
-        live.emit(
-            logging.ERROR,
-            "its last callback does not end; it is left behind, and shutdown() runs elsewhere",
-        )
     if not live.claim_shutdown():
         nothing: Future[bool] = Future()
         nothing.set_result(True)
@@ -89,16 +130,19 @@ def begin_shutdown(live: LiveNode, home: Executor | None) -> Future[bool]:
 def _stand_in(live: LiveNode) -> Future[bool]:
     future: Future[bool] = Future()
     # A copy: the stuck tick still holds the node's own context.
-    context = live.context.copy()
-    if live.is_async:
+    context, name = live.context.copy(), f"horus-shutdown:{live.name}"
+    if live.is_async and asyncio._get_running_loop() is not None:
         task = asyncio.get_running_loop().create_task(
-            live.run_phase_async("shutdown"), name=f"horus-shutdown:{live.name}", context=context
+            live.run_phase_async("shutdown"), name=name, context=context
         )
         task.add_done_callback(lambda done: future.set_result(not done.cancelled()))
         return future
 
     def run() -> None:
-        future.set_result(context.run(live.run_phase, "shutdown"))
+        if live.is_async:
+            future.set_result(context.run(asyncio.run, live.run_phase_async("shutdown")))
+        else:
+            future.set_result(context.run(live.run_phase, "shutdown"))
 
-    threading.Thread(target=run, name=f"horus-shutdown:{live.name}", daemon=True).start()
+    threading.Thread(target=run, name=name, daemon=True).start()
     return future

@@ -8,8 +8,9 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
+from typing import NamedTuple
 
 from horus.errors import CallbackInterrupted
 
@@ -19,10 +20,15 @@ _OWNED = (signal.SIGINT, signal.SIGTERM)
 _LAST_WORDS_S = 0.3
 """How long the log may take to reach the terminal before the process ends [s]."""
 
-_LAST_ACTS_S = 1.0
-"""How long safe-state hooks may take, all together, before the process ends [s]."""
-
 InCallback = Callable[[FrameType | None], bool]
+
+
+class LastAct(NamedTuple):
+    """What is still done for the robot before the process is forced to end."""
+
+    act: Callable[[], None]
+    limit_s: Callable[[], float]
+    """Returns how long it may take [s]."""
 
 
 class SignalOwner:
@@ -34,21 +40,28 @@ class SignalOwner:
     """
 
     def __init__(
-        self, stop: Callable[[str], None], last_act: Callable[[], None], in_callback: InCallback
+        self,
+        stop: Callable[[str], None],
+        make_safe: LastAct,
+        shut_down: LastAct,
+        in_callback: InCallback,
     ) -> None:
         """Own the signals from `owning` on.
 
         Args:
             stop: Ends the run in order, for a reason.
-            last_act: Makes the robot safe before the process is forced to end.
+            make_safe: Precedes every forced end.
+            shut_down: Follows, unless somebody who asks a second time wants it to be over.
             in_callback: Tells whether a frame of the main thread is in a node's callback.
         """
         self._stop = stop
-        self._last_act = last_act
+        self._make_safe, self._shut_down = make_safe, shut_down
         self._in_callback = in_callback
         self._received = 0
         self._pid = os.getpid()
         self._interrupting = False
+        self.interrupted = False
+        """Whether the last `interrupt` has reached the callback."""
         self.owns = False
         """Whether the signals are ours: only the main thread can own them."""
 
@@ -73,10 +86,12 @@ class SignalOwner:
         """Raise `CallbackInterrupted` in the callback that occupies the main thread.
 
         A system call that it waits in returns early for that; if it computes in an
-        extension, nothing happens until that returns.
+        extension, nothing happens until that returns. Nothing happens either where the
+        callback has called something of ours: see `interrupted`, and try again.
 
         Thread: any other.
         """
+        self.interrupted = False
         if self.owns:
             self._interrupting = True
             main = threading.main_thread().ident
@@ -85,7 +100,8 @@ class SignalOwner:
 
     def force_exit(self, why: str) -> None:
         """End the process with the exit code of the signal that was received, else 1."""
-        _end(128 + self._received if self._received else 1, why, self._last_act)
+        code = 128 + self._received if self._received else 1
+        _end(code, why, (self._make_safe, self._shut_down))
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if os.getpid() != self._pid:
@@ -97,41 +113,47 @@ class SignalOwner:
             self._interrupting = False
             # Anywhere else an exception would hit what only just keeps order.
             if self._in_callback(frame):
+                self.interrupted = True
                 raise CallbackInterrupted
             return
         if self._received:
-            _end(128 + number, f"{signal.Signals(number).name} again", self._last_act)
+            _end(128 + number, f"{signal.Signals(number).name} again", (self._make_safe,))
             while True:
                 signal.pause()
         self._received = number
         self._stop(f"received {signal.Signals(number).name}")
 
 
-def _end(code: int, why: str, last_act: Callable[[], None]) -> None:
+def _end(code: int, why: str, last_acts: Sequence[LastAct]) -> None:
     """End the process, after what can still be done for the robot and said to its people.
 
     The end is certain, and comes from C: a hook may hang, stderr may block, and
     whatever the signal has interrupted may hold any lock.
     """
-    _thread.start_new_thread(_end_process, (code, last_act))
+    _thread.start_new_thread(_end_process, (code, last_acts))
     _thread.start_new_thread(_log.critical, ("%s: exiting at once", why))
 
 
-def _end_process(code: int, last_act: Callable[[], None]) -> None:
+def _end_process(code: int, last_acts: Sequence[LastAct]) -> None:
     try:
-        acted = _thread.allocate_lock()
-        acted.acquire()
-
-        def act() -> None:
-            try:
-                last_act()
-            finally:
-                acted.release()
-
-        _thread.start_new_thread(act, ())
-        acted.acquire(True, _LAST_ACTS_S)
+        for last_act in last_acts:
+            _act(last_act)
         pause = _thread.allocate_lock()
         pause.acquire()
         pause.acquire(True, _LAST_WORDS_S)
     finally:
         os._exit(code)
+
+
+def _act(last_act: LastAct) -> None:
+    acted = _thread.allocate_lock()
+    acted.acquire()
+
+    def act() -> None:
+        try:
+            last_act.act()
+        finally:
+            acted.release()
+
+    _thread.start_new_thread(act, ())
+    acted.acquire(True, last_act.limit_s())

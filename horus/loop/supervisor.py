@@ -13,6 +13,7 @@ from typing import Any
 
 from horus import os_rt
 from horus.clock import FOREVER_NS, Timeline
+from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.ending import Ending, WayOut
 from horus.loop.fault_log import FaultLog
@@ -96,6 +97,10 @@ class Supervisor:
     def look_again(self) -> None:
         """Take note that nodes have come, or that a timeout has changed."""
         self._thread.call(self._changed.set)
+
+    def critical_late(self, live: LiveNode, lasted_ns: int) -> None:
+        """Act on a critical node's tick that took too long [ns] and ended before we could look."""
+        self._thread.call(functools.partial(self._inspector.critical_late, live, lasted_ns))
 
     def report(self, write: Callable[[], None]) -> None:
         """Log something soon; return at once."""

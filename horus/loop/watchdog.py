@@ -56,10 +56,13 @@ class Watchdog:
     Three rules keep it just:
 
     - A node that cannot begin because another one's tick has its thread is not to
-      blame. A critical node counts all the same: its motor is not controlled.
+      blame. A critical node counts all the same: its motor is not controlled. And one
+      that cannot begin for another reason, because the application blocks its own event
+      loop, is not what hangs: it becomes unhealthy at most.
     - When `look` itself comes late by a quarter of a timeout or more, because the
       process was suspended or something held the interpreter, that time is not
-      counted, and the tick has half a timeout more to end. For a critical node it is.
+      counted, and the tick has half a timeout more to end. For a critical node it is;
+      should its tick end before anybody looks, the tick path tells (`Control.critical_late`).
     - A tick that ends makes a node healthy again, unless it is isolated.
 
     Thread: one, except `watched`, `timeout_of` and `shortest_ns`: any.
@@ -149,13 +152,15 @@ class Watchdog:
             vigil.excused_until_ns = now_ns
         counted_from_ns = max(began_ns + vigil.unwatched_ns, vigil.excused_until_ns)
         health = grade(now_ns - counted_from_ns, timeout_ns)
-        stages = GRADES.index(health)
-        self._look_again_at(counted_from_ns + (stages + 1) * timeout_ns + 1)
+        next_grade_ns = counted_from_ns + (GRADES.index(health) + 1) * timeout_ns + 1
+        if health is Health.ISOLATED and not running:
+            health, next_grade_ns = Health.UNHEALTHY, now_ns + timeout_ns
+        self._look_again_at(next_grade_ns)
         lasted_ns = now_ns - since_ns
         critical = lasted_ns > critical_ns
         # Another tick may begin right after this look.
         self._look_again_at((now_ns if critical else since_ns) + critical_ns + 1)
-        worse = stages > GRADES.index(live.health)
+        worse = GRADES.index(health) > GRADES.index(live.health)
         if not (worse or critical or recovered):
             return None
         health = health if worse else live.health

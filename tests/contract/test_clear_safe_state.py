@@ -110,8 +110,8 @@ def test_an_isolated_node_ticks_again_once_its_tick_has_returned(make, way):
         assert expirations(sched) == 1
 
 
-def test_clear_safe_state_without_one_does_nothing(make):
-    """Where nobody is held, clear_safe_state() returns that nobody remains."""
+def test_clear_safe_state_without_one_does_nothing(make, caplog):
+    """Where nobody is held, clear_safe_state() returns that nobody remains, and logs nothing."""
     sched = make()
     witness = Witness(sched)
     witness.add("Rt", "motor")
@@ -121,6 +121,7 @@ def test_clear_safe_state_without_one_does_nothing(make):
         assert sched.clear_safe_state() == []
         before = witness.ticks["motor"]
         wait_until(lambda: witness.ticks["motor"] > before)
+    assert "cleared" not in caplog.text
 
 
 def test_the_safe_state_can_be_entered_again(make):

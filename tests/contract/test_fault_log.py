@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import threading
 
 import pytest
 
 from horus import Node
 
-from .helpers import nothing, wait_until
+from .helpers import nothing, running, wait_until
 
 pytestmark = pytest.mark.realtime
 
@@ -90,3 +91,48 @@ def test_two_schedulers_share_the_only_timer_of_the_process(make):
     assert second.fault_log is None
     first.stop()
     runner.join()
+
+    with_timer = []
+    second.add(Node("eyes", lambda node: with_timer.append(second.fault_log), rate=10))
+    runner = threading.Thread(target=second.run)
+    runner.start()
+    try:
+        wait_until(lambda: with_timer and with_timer[-1] is not None)
+    finally:
+        second.stop()
+        runner.join()
+
+
+def test_the_timer_goes_to_the_second_scheduler_when_the_first_one_ends(make):
+    """Who had to go without gets the timer in the middle of its run."""
+    first, second = make(watchdog_ms=200, name="first"), make(watchdog_ms=200, name="second")
+    for sched in (first, second):
+        sched.add(Node("motor", nothing, rate=100))
+    with running(first):
+        wait_until(lambda: first.fault_log is not None)
+        with running(second):
+            wait_until(lambda: second.get_node_stats("motor")["total_ticks"] > 10)
+            assert second.fault_log is None
+            first.stop()
+            wait_until(lambda: second.fault_log is not None)
+        assert second.fault_log is None
+
+
+def test_a_full_disk_does_not_hide_a_standstill(make, tmp_path, caplog):
+    """That there are no stacks is one thing, that Python stood still another."""
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / f"scheduler-{os.getpid()}.stacks").symlink_to("/dev/full")
+    sched = make(watchdog_ms=100, name="scheduler")
+    held = []
+
+    def tick(node):
+        if not held:
+            held.append(1)
+            hold_the_interpreter(1.6)
+
+    sched.add(Node("motor", tick, rate=100))
+    sched.run(duration=2.2)
+
+    assert caplog.text.count("Python stood still for more than 1.00 s") == 1
+    assert "could not be written" in caplog.text

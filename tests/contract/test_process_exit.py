@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -102,8 +103,27 @@ def test_a_program_of_its_own_is_never_interrupted(make, caplog):
     assert sched.get_node_stats("stuck")["errors_count"] == 0
 
 
+def test_a_callback_that_is_interrupted_can_clean_up(make, loop):
+    """The exception comes once: a `finally` that takes its time is not cut short by another."""
+    sched = make(loop=loop, shutdown_timeout=1.0)
+    journal = []
+
+    def blocks(node):
+        try:
+            time.sleep(PATIENCE_S)
+        finally:
+            time.sleep(0.4)
+            journal.append("port closed")
+
+    sched.add(Node("stuck", blocks, shutdown=lambda node: journal.append("shutdown")))
+    sched.run(duration=0.1)
+
+    assert journal == ["port closed", "shutdown"]
+    assert sched.get_node_stats("stuck")["errors_count"] == 1
+
+
 STUCK_IN_C = """
-    import ctypes, threading
+    import ctypes, threading, time
     from horus import Node, Scheduler
 
     c = ctypes.CDLL(None)
@@ -113,16 +133,31 @@ STUCK_IN_C = """
         c.pthread_mutex_lock(mutex)
         c.pthread_mutex_lock(mutex)
 
+    def nothing(node): pass
+    async def nothing_async(node): pass
+
+    def down(node):
+        print("down", node.name, flush=True)
+        if node.name == "hangs":
+            time.sleep(60)
+
+    async def down_async(node):
+        down(node)
+
     sched = Scheduler(shutdown_timeout=0.3)
-    sched.add(Node("stuck", deadlock))
+    sched.add(Node("stuck", deadlock, shutdown=down, order=9))
     safe = lambda node: print("safe", flush=True)
-    sched.add(Node("motor", lambda node: None, rate=100, safe_state=safe))
+    sched.add(Node("motor", nothing, rate=100, order=0, safe_state=safe, shutdown=down))
+    sched.add(Node("planner", nothing, rate=100, compute=True, order=1, shutdown=down))
+    sched.add(Node("hangs", nothing, rate=100, order=2, shutdown=down))
+    sched.add(Node("uploader", nothing_async, rate=100, order=3, shutdown=down_async))
+    sched.add(Node("logger", nothing, order=4, shutdown=down))
     sched.run(duration=0.1)
 """
 
 
 def test_a_main_thread_that_is_lost_in_an_extension_ends_the_process():
-    """What cannot be interrupted is left: safe-state hooks run, then the process exits."""
+    """What cannot be interrupted is left: hooks, then every shutdown() in order, then the end."""
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(STUCK_IN_C)],
         capture_output=True,
@@ -131,8 +166,10 @@ def test_a_main_thread_that_is_lost_in_an_extension_ends_the_process():
         check=False,
     )
     assert done.returncode == 1
-    assert done.stdout == "safe\n"
+    in_order = ["stuck", "logger", "uploader", "hangs", "planner", "motor"]
+    assert done.stdout.splitlines() == ["safe", *(f"down {name}" for name in in_order)]
     assert "does not come back" in done.stderr
+    assert "'hangs'" in done.stderr
 
 
 SECOND_SIGNAL = """
@@ -198,3 +235,61 @@ def test_work_handed_to_a_thread_that_never_returns_does_not_keep_the_process():
         print("returned")
     """
     assert run_program(program).stdout == "returned\n"
+
+
+def test_a_terminal_that_nobody_reads_does_not_keep_the_process():
+    """A stderr that blocks for ever costs the log, not the run and not the end of the process."""
+    program = """
+        from horus import Node, Scheduler
+
+        def tick(node):
+            node.log_warning("x" * 1000)
+
+        sched = Scheduler()
+        sched.add(Node("motor", tick, rate=200))
+        sched.run(duration=0.5)
+        print("returned", sched.get_node_stats("motor")["total_ticks"] > 20, flush=True)
+    """
+    reader, writer = os.pipe()
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-c", textwrap.dedent(program)],
+            stdout=subprocess.PIPE,
+            stderr=writer,
+            text=True,
+        )
+        try:
+            stdout, _ = process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()
+    finally:
+        os.close(reader)
+        os.close(writer)
+    assert stdout == "returned True\n"
+    assert process.returncode == 0
+
+
+def test_a_failure_is_raised_although_the_report_cannot_be_printed():
+    """verbose=True on a closed stdout: what a fatal node has raised comes first."""
+    done = run_program(
+        """
+        import os, sys
+        from horus import Node, NodeError, Scheduler
+
+        def fail(node):
+            raise OSError("no echo")
+
+        reader, writer = os.pipe()
+        os.close(reader)
+        sys.stdout = os.fdopen(writer, "w", buffering=1)
+        sched = Scheduler(verbose=True)
+        sched.add(Node("sonar", fail, failure_policy="fatal"))
+        try:
+            sched.run()
+        except NodeError as exc:
+            print("raised", exc, file=sys.stderr)
+        sys.stdout = None
+        """
+    )
+    assert "raised" in done.stderr
+    assert "no echo" in done.stderr

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
+import os
 import threading
 import time
 
@@ -18,12 +20,23 @@ from .freezing import (
     Witness,
     await_health,
     cleared,
+    expirations,
     freezing_node,
     in_safe_state,
     remaining,
     reports,
 )
-from .helpers import TRIGGER, as_async, nothing, running, wait_until
+from .helpers import (
+    PATIENCE_S,
+    TRIGGER,
+    all_have_ticked,
+    as_async,
+    node_of,
+    nothing,
+    run_program,
+    running,
+    wait_until,
+)
 
 pytestmark = pytest.mark.realtime
 
@@ -233,3 +246,204 @@ def test_async_hooks_run_on_the_loop_when_it_is_free_and_elsewhere_when_it_is_bl
 
         on_loop = witness.hook_threads["uploader"] == loop_threads[0]
         assert on_loop == (way not in ON_LOOP)
+
+
+def test_a_hook_that_spins_does_not_keep_the_nodes_from_running(make):
+    """Below supervision and above the nodes: once it has had its time, a hook is below them."""
+    if not make(rt=True).capabilities()["rt_scheduling"]:
+        pytest.skip("SCHED_FIFO is not permitted")
+    sched = make(rt=True)
+    freezer = Freezer(armed=False)
+    policies, over = [], threading.Event()
+
+    def hook(node):
+        while not over.wait(0.001):
+            policies.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+
+    sched.add(Node("hangs", nothing, rate=50, safe_state=hook))
+    sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False, watchdog=60.0))
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    with running(sched), freezer:
+        try:
+            freezer.freeze()
+            wait_until(lambda: policies and policies[-1] == os.SCHED_OTHER)
+            assert policies[0] == os.SCHED_FIFO
+        finally:
+            over.set()
+
+
+def test_a_hook_of_an_earlier_run_that_still_hangs_has_no_say_in_the_next(make):
+    """What a hook from before does when it returns at last does not end the next one's episode."""
+    sched = make()
+    freezer = Freezer(armed=False)
+    hooks, first, second = [], threading.Event(), threading.Event()
+
+    def hook(node):
+        hooks.append(1)
+        (first if len(hooks) == 1 else second).wait(PATIENCE_S)
+
+    sched.add(Node("motor", nothing, rate=50, safe_state=hook))
+    sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False, watchdog=60.0))
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    try:
+        for episode in (1, 2):
+            with running(sched), freezer:
+                wait_until(lambda: all_have_ticked(sched))
+                freezer.freeze()
+                wait_until(lambda episode=episode: len(hooks) == episode)
+                if episode == 2:
+                    freezer.thaw()
+                    first.set()
+                    wait_until(lambda: remaining(sched) is not None)
+                    assert remaining(sched) == ["motor"]
+                    second.set()
+                    wait_until(lambda: cleared(sched))
+    finally:
+        first.set()
+        second.set()
+
+
+def test_hooks_are_called_even_if_the_process_can_have_no_more_threads():
+    """The last resort: without a thread of its own, a hook runs where it is asked for."""
+    done = run_program(
+        """
+        import os, resource, threading, time
+        from horus import Node, Scheduler
+
+        blocked, hooks = [], []
+
+        def block(node):
+            if blocked:
+                blocked.clear()
+                time.sleep(0.5)
+
+        sched = Scheduler()
+        sched.add(Node("motor", lambda node: None, rate=100, safe_state=hooks.append))
+        sched.add(Node("critical", block, rate=20))
+        sched.add_critical_node("critical", timeout_ms=100)
+
+        def exhaust():
+            time.sleep(0.3)
+            resource.setrlimit(resource.RLIMIT_NPROC, (1, 1))
+            try:
+                threading.Thread(target=print).start()
+            except RuntimeError:
+                pass
+            else:
+                print("there are threads")
+            blocked.append(1)
+
+        exhausting = threading.Thread(target=exhaust)
+        os.setgid(65534)
+        os.setuid(65534)
+        exhausting.start()
+        sched.run(duration=1.5)
+        print(sched.safety_stats()["safe_state"], [node.name for node in hooks])
+        """,
+        HORUS_HOME="/proc/self/none",
+    )
+    assert done.stdout.splitlines() == ["True ['motor']"]
+
+
+# -- the last command ------------------------------------------------------------------------------
+
+
+def test_a_hook_follows_the_tick_in_progress_and_delays_no_other(make):
+    """A healthy tick of 60 ms ends before its hook begins; the others do not wait for it."""
+    sched = make()
+    freezer = Freezer(armed=False)
+    journal, begun = [], threading.Event()
+
+    def slow(node):
+        if freezer.frozen_thread is not None and not begun.is_set():
+            begun.set()
+            time.sleep(60 * ms)
+            journal.append("command")
+
+    def hook(node):
+        journal.append(f"hook of {node.name}")
+
+    sched.add(Node("arm", slow, rate=50, compute=True, order=20, safe_state=hook))
+    sched.add(Node("motor", nothing, rate=50, order=10, safe_state=hook))
+    sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False, watchdog=60.0))
+    sched.add_critical_node("critical", timeout_ms=20)
+    with running(sched), freezer:
+        freezer.freeze()
+        wait_until(lambda: len(journal) == 3)
+
+    assert journal == ["hook of motor", "command", "hook of arm"]
+
+
+def test_a_removed_node_is_shut_down_after_its_hook(make):
+    """remove_node() in the safe state: first the hook ends, then shutdown() is called."""
+    sched = make()
+    freezer = Freezer(armed=False)
+    journal, in_hook = [], threading.Event()
+
+    def hook(node):
+        in_hook.set()
+        time.sleep(50 * ms)
+        journal.append("hook")
+
+    sched.add(
+        Node(
+            "motor", nothing, rate=50, safe_state=hook, shutdown=lambda: journal.append("shutdown")
+        )
+    )
+    sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False, watchdog=60.0))
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    with running(sched), freezer:
+        wait_until(lambda: all_have_ticked(sched))
+        freezer.freeze()
+        assert in_hook.wait(PATIENCE_S)
+        sched.remove_node("motor")
+        assert journal == ["hook", "shutdown"]
+
+
+# -- what nobody could see -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["BestEffort", "AsyncIo", "Rt", "Compute"])
+def test_a_critical_tick_that_ends_too_late_counts_even_if_nobody_could_look(make, kind, caplog):
+    """An extension holds the interpreter: supervision stood still, and so did the motor."""
+    sched = make()
+    hooks, armed = [], []
+
+    def hold(node):
+        if armed:
+            armed.clear()
+            ctypes.PyDLL(None).usleep(400_000)
+
+    sched.add(Node("vision", hold, rate=20, compute=True, order=50))
+    sched.add(node_of(kind, "motor", rate=100, safe_state=hooks.append))
+    sched.add_critical_node("motor", timeout_ms=TIMEOUT_MS)
+    with running(sched):
+        for episode in (1, 2, 3):
+            before = sched.get_node_stats("motor")["total_ticks"]
+            wait_until(lambda before=before: sched.get_node_stats("motor")["total_ticks"] > before)
+            armed.append(1)
+            wait_until(lambda episode=episode: in_safe_state(sched) and len(hooks) == episode)
+            wait_until(lambda: cleared(sched))
+
+    assert caplog.text.count("safe state entered: critical node motor") == 3
+    assert expirations(sched, "motor") >= 3  # both who ticks and who looks may have seen one
+
+
+def test_a_backlog_of_a_critical_node_is_owed_one_message_after_another(make):
+    """Messages that wait behind another one's tick do not make a critical node late."""
+    sched = make()
+    done = []
+
+    def tick(node):
+        time.sleep(40 * ms)
+        done.append(1)
+
+    sched.add(Node("estop", tick, on=TRIGGER))
+    sched.add_critical_node("estop", timeout_ms=2 * TIMEOUT_MS)
+    with running(sched):
+        for index in range(8):
+            sched.publish(TRIGGER, index)
+        wait_until(lambda: len(done) == 8)
+
+    assert not in_safe_state(sched)
+    assert expirations(sched, "estop") == 0

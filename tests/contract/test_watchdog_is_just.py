@@ -19,7 +19,17 @@ from .freezing import (
     freezing_node,
     reports,
 )
-from .helpers import TRIGGER, as_async, node_of, nothing, run_program, running, wait_until
+from .helpers import (
+    TRIGGER,
+    as_async,
+    node_of,
+    nothing,
+    run_async,
+    run_program,
+    running,
+    until,
+    wait_until,
+)
 
 pytestmark = pytest.mark.realtime
 
@@ -138,6 +148,33 @@ def test_nodes_that_wait_behind_a_frozen_one_are_not_blamed(make, way):
 
         assert {name: expirations(sched, name) for name in ticks} == dict.fromkeys(ticks, 0)
         assert expirations(sched) == 1
+
+
+def test_an_application_that_blocks_its_own_loop_has_no_node_isolated(make, loop, caplog):
+    """Nobody is there to blame: its nodes become unhealthy, and tick on when the loop is free."""
+    sched = make(watchdog_ms=TIMEOUT_MS, loop=loop)
+    hooks, ticks = [], []
+    for kind in ("BestEffort", "AsyncIo"):
+        sched.add(node_of(kind, kind, ticks.append, rate=50, safe_state=hooks.append))
+
+    async def application():
+        run = asyncio.ensure_future(sched.arun())
+        await until(lambda: len(ticks) >= 6)
+        time.sleep(6 * TIMEOUT_MS * ms)  # noqa: ASYNC251 - the application's mistake
+        stats = sched.safety_stats()
+        before = len(ticks)
+        await until(lambda: len(ticks) >= before + 6)
+        sched.stop()
+        await run
+        return stats["health_states"]
+
+    health = run_async(application(), loop)
+
+    assert health == {"BestEffort": "unhealthy", "AsyncIo": "unhealthy"}
+    assert hooks == []
+    assert set(sched.safety_stats()["health_states"].values()) == {"healthy"}
+    assert "cannot begin" in caplog.text
+    assert "time.sleep(6 * TIMEOUT_MS * ms)" in caplog.text
 
 
 def test_an_async_tick_in_progress_is_not_blamed_for_a_blocked_loop(make):

@@ -15,7 +15,9 @@ def make_live(name: str, sequence: int, *, order: int = 0, hook: bool = True) ->
     """Return a node that is initialised and in service."""
     safe_state = (lambda: None) if hook else None
     node = Node(name, lambda: None, order=order, safe_state=safe_state)
-    live = LiveNode(node, Timeline(SimClock(), 1000.0), RunControl(None), sequence)
+    live = LiveNode(
+        node, Timeline(SimClock(), 1000.0), RunControl(None, lambda live, lasted_ns: None), sequence
+    )
     live.run_phase("init")
     live.enter_service()
     return live

@@ -66,6 +66,36 @@ def test_messages_are_owed_one_after_another(ticks):
     assert not world.safety.active
 
 
+@given(lengths, st.integers(0, 5 * TIMEOUT), st.integers(0, 2 * TIMEOUT))
+def test_a_critical_tick_counts_by_what_it_took_whoever_could_look(length, suspended, waited):
+    """The safe state follows from release and end alone, not from when supervision could look."""
+    world = World(100 * TIMEOUT, critical_ns=TIMEOUT)
+    released_ns = world.clock.now_ns()
+    world.suspend(waited)
+    world.tick(length, suspended_for_ns=suspended, release_ns=released_ns)
+
+    late = waited + length + suspended > TIMEOUT
+    assert world.safety.active == late
+    assert world.hooks == world.expirations == late
+
+
+@given(st.integers(0, 20 * TIMEOUT))
+def test_a_tick_that_cannot_begin_isolates_nobody(waits):
+    """It is not the node that hangs: it is unhealthy at most, and well when its tick has ended."""
+    world = World(TIMEOUT)
+    world.thread_of_node = None
+    world.due_since_ns = world.clock.now_ns()
+    world.look()
+    world.idle(waits)
+    stages = min(max(0, waits - 1) // TIMEOUT, 2)
+    assert world.health is (Health.HEALTHY, Health.WARNING, Health.UNHEALTHY)[stages]
+    world.due_since_ns = None
+    assert world.tick(0)
+    world.look()
+    assert world.health is Health.HEALTHY
+    assert world.hooks == 0
+
+
 @given(st.integers(0, 20 * TIMEOUT), st.integers(0, TIMEOUT))
 def test_a_message_that_waits_for_a_restart_is_owed_from_then_on(waited, length):
     """The back-off of a restart, 100 ms here, is held against nobody, nor is what came before."""

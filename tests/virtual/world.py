@@ -39,8 +39,10 @@ class World:
         node = Node("node", self._tick, safe_state=self._hook)
         self.seen: list[tuple[int, Health]] = []
         """What supervision has made of the node, and after how much of its tick [ns]."""
-        self.live = LiveNode(node, timeline, RunControl(None), 0)
-        self.live.critical_ns = critical_ns
+        control = RunControl(None, lambda *late: self._inspector.critical_late(*late))
+        self.live = LiveNode(node, timeline, control, 0)
+        if critical_ns is not None:
+            self.live.make_critical(critical_ns)
         self.live.run_phase("init")
         self.live.enter_service()
         self._run_tick = build_tick(self.live)
