@@ -62,7 +62,7 @@ class Watchdog:
     - When `look` itself comes late by a quarter of a timeout or more, because the
       process was suspended or something held the interpreter, that time is not
       counted, and the tick has half a timeout more to end. For a critical node it is;
-      should its tick end before anybody looks, the tick path tells (`Control.critical_late`).
+      should its tick end before anybody looks, who ticks it tells (`LiveNode.check_critical`).
     - A tick that ends makes a node healthy again, unless it is isolated.
 
     Thread: one, except `watched`, `timeout_of` and `shortest_ns`: any.
