@@ -25,19 +25,24 @@ def hold_the_interpreter(seconds: float) -> None:
     ctypes.PyDLL(None).usleep(int(seconds * 1e6))
 
 
-def test_a_tick_that_holds_the_interpreter_leaves_its_stack_in_a_file(make, caplog):
-    """The stacks of all threads are written while no Python thread can run, and reported."""
-    sched = make(watchdog_ms=200)
-    during = []
-    sched.add(Node("other", lambda node: during.append(sched.fault_log), rate=10))
+def once_holding(seconds):
+    """Return a tick that holds the interpreter the first time."""
     held = []
 
     def tick(node):
         if not held:
             held.append(1)
-            hold_the_interpreter(1.8)
+            hold_the_interpreter(seconds)
 
-    sched.add(Node("motor", tick, rate=100))
+    return tick
+
+
+def test_a_tick_that_holds_the_interpreter_leaves_its_stack_in_a_file(make, caplog):
+    """The stacks of all threads are written while no Python thread can run, and reported."""
+    sched = make(watchdog_ms=200)
+    during = []
+    sched.add(Node("other", lambda node: during.append(sched.fault_log), rate=10))
+    sched.add(Node("motor", once_holding(1.8), rate=100))
     sched.run(duration=2.5)
 
     assert sched.fault_log is not None
@@ -124,14 +129,7 @@ def test_a_full_disk_does_not_hide_a_standstill(make, tmp_path, caplog):
     home.mkdir()
     (home / f"scheduler-{os.getpid()}.stacks").symlink_to("/dev/full")
     sched = make(watchdog_ms=100, name="scheduler")
-    held = []
-
-    def tick(node):
-        if not held:
-            held.append(1)
-            hold_the_interpreter(1.6)
-
-    sched.add(Node("motor", tick, rate=100))
+    sched.add(Node("motor", once_holding(1.6), rate=100))
     sched.run(duration=2.2)
 
     assert caplog.text.count("Python stood still for more than 1.00 s") == 1
