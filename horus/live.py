@@ -127,6 +127,8 @@ class LiveNode:
         self.hook_returned.set()
         self.revival_ns = clock.NEVER
         """Since when `init()` runs again in place of a tick [ns]; `NEVER` while it does not."""
+        self.waited_until_ns = clock.NEVER
+        """Until when the node waits for its predecessors, or has last waited [ns]."""
         self.reports = NodeReports(core.log, self.tick_context)
         self.callbacks = core.callbacks
         self._claims = threading.Lock()
@@ -425,9 +427,10 @@ class LiveNode:
     def owed_from_ns(self) -> int:
         """The instant before which no tick is owed, whatever waits [ns].
 
-        Messages wait while nothing runs, and while the node is to restart.
+        Messages wait while nothing runs, and while the node is to restart. How long it
+        waits for its predecessors is bounded and by design, however short a timeout.
         """
-        return max(self.timeline.epoch_ns, self._restart_at_ns)
+        return max(self.timeline.epoch_ns, self._restart_at_ns, self.waited_until_ns)
 
     @property
     def has_hook(self) -> bool:

@@ -58,7 +58,6 @@ class RtThread(NodeThread):
         self._violated_ns = clock.NEVER
         self._pardoned_ns = clock.NEVER
         self._pardon_ends_ns = clock.NEVER
-        self._owed_from_ns = clock.NEVER
         self._spin_ns = real_time.spin_ns
         self._most_lead_ns = 0
         self._lead_ns = 0
@@ -111,18 +110,13 @@ class RtThread(NodeThread):
             self._join_grid(min(self._release_ns, self._now_ns()))
 
     def due_ns(self, now_ns: int) -> int | None:
-        """Return since when a tick that has not begun is owed [ns], if one is.
-
-        Since its release, or since the node has waited for its predecessors: that is
-        bounded and by design, however short the watchdog's timeout.
+        """Return the release whose tick has not begun [ns], if one is due.
 
         Thread: any.
         """
         release_ns = self._release_ns
-        if not self.engaged or release_ns >= self._timeline.end_ns:
-            return None
-        owed_from_ns = max(release_ns, self._owed_from_ns)
-        return owed_from_ns if owed_from_ns <= now_ns else None
+        due = self.engaged and release_ns <= now_ns and release_ns < self._timeline.end_ns
+        return release_ns if due else None
 
     def _join_grid(self, from_ns: int) -> None:
         self.grid = self.live.grid()
@@ -159,11 +153,11 @@ class RtThread(NodeThread):
             return False
         if self not in predecessor._waiting:
             predecessor._waiting.append(self)
-        self._owed_from_ns = limit_ns
+        self.live.waited_until_ns = limit_ns
         # Looked at again now that the predecessor can see us.
         if predecessor.done_ns < release_ns:
             self.park(limit_ns - now_ns)
-        self._owed_from_ns = min(self._now_ns(), limit_ns)
+        self.live.waited_until_ns = min(self._now_ns(), limit_ns)
         return True
 
     def _last_chance_ns(self, release_ns: int, limit_ns: int, now_ns: int) -> int:

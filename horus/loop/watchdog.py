@@ -187,4 +187,5 @@ def _due_ns(live: LiveNode, home: Home, now_ns: int) -> int:
     due_ns = home.due_ns(live, now_ns)
     if due_ns is None:
         return NEVER
-    return max(due_ns, live.tick_context.finish_ns, live.owed_from_ns)
+    owed_from_ns = max(due_ns, live.tick_context.finish_ns, live.owed_from_ns)
+    return owed_from_ns if owed_from_ns <= now_ns else NEVER

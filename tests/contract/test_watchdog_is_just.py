@@ -212,6 +212,20 @@ def test_nodes_that_wait_for_slow_predecessors_are_not_frozen(make):
     assert sched.safety_stats()["watchdog_expirations"] == 0
 
 
+def test_a_critical_node_may_wait_for_slow_predecessors(make):
+    """How long it waits is part of the schedule; its limit is for what it does itself."""
+    sched = make(watchdog_ms=1000)
+    sched.add(Node("slow", lambda node: time.sleep(0.2), rate=2, budget=0.4, order=0))
+    sched.add(Node("critical", nothing, rate=2, deadline=0.45, order=1))
+    sched.add_critical_node("critical", timeout_ms=TIMEOUT_MS)
+    with running(sched):
+        wait_until(lambda: sched.get_node_stats("critical")["total_ticks"] >= 3)
+        stats = sched.safety_stats()
+
+    assert stats["safe_state"] is False
+    assert expirations(sched, "critical") == stats["order_violations"] == 0
+
+
 @pytest.mark.parametrize("way", ["Rt", "Compute", "AsyncIo", "urgent Event"])
 def test_the_other_nodes_tick_on_beside_a_frozen_one(make, way):
     """A frozen node that does not block the loop is isolated, not contagious."""
