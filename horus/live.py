@@ -17,6 +17,7 @@ from horus.core import core_of
 from horus.errors import NodeError
 from horus.reports import NodeReports
 from horus.spec import ExecutionClass, Health, NodeSpec, NodeState
+from horus.standing import Standing
 from horus.stats import NodeCounters
 from horus.timing import ReleaseGrid
 from horus.units import NS_PER_MS, NS_PER_S, readable
@@ -97,7 +98,6 @@ class LiveNode:
         self.sequence = sequence
         self.counters = counters or NodeCounters()
         self.state = NodeState.UNINITIALIZED
-        self.health = Health.HEALTHY
         self.trigger: Subscription | None = None
         self.publishes = frozenset(pub.topic for pub in core.pubs)
         self.subscribes = frozenset(sub.topic for sub in core.subs)
@@ -114,23 +114,16 @@ class LiveNode:
         """Whether a thread or task that never returned may still hold this object."""
         self.skip_next = False
         self.in_episode = False
-        self.held = False
-        """Whether the node is kept from ticking until the safe state is cleared."""
-        self.alert = False
-        """Whether the end of the next tick deserves a closer look."""
         self.critical_ns: int | None = None
-        """How long a tick of a critical node may take [ns]; None for other nodes."""
-        self.holds = 0
-        """How often the node has been held."""
-        self.hook_returned = threading.Event()
-        """Whether no safe-state hook is owed or in progress."""
-        self.hook_returned.set()
+        """How long a critical node may be owed a tick [ns]; None for other nodes."""
         self.revival_ns = clock.NEVER
         """Since when `init()` runs again in place of a tick [ns]; `NEVER` while it does not."""
         self.waited_until_ns = clock.NEVER
         """Until when the node waits for its predecessors, or has last waited [ns]."""
         self.reports = NodeReports(core.log, self.tick_context)
         self.callbacks = core.callbacks
+        has_hook = core.callbacks["safe_state"] is not None
+        self.standing = Standing(self.counters, self._close_gate, has_hook=has_hook)
         self._claims = threading.Lock()
         self._restart_at_ns = 0
         self._backoff_ns = FIRST_BACKOFF_NS
@@ -299,9 +292,8 @@ class LiveNode:
         """Get ready for another `init()`: a new run begins."""
         if not self.initialized:
             self.state = NodeState.UNINITIALIZED
-            self.skip_next = self.in_episode = self.held = self.alert = False
-            self.hook_returned.set()
-            self.health = Health.HEALTHY
+            self.skip_next = self.in_episode = False
+            self.standing.renew()
             context = self.tick_context
             context.start_ns = context.previous_ns = context.finish_ns = clock.NEVER
 
@@ -345,7 +337,7 @@ class LiveNode:
             self.gated = True
 
     def _must_be_admitted(self) -> bool:
-        closed = self.retired or self.held or self.skip_next
+        closed = self.retired or self.standing.held or self.skip_next
         return closed or self.state is not NodeState.RUNNING
 
     def enter_service(self) -> None:
@@ -361,7 +353,7 @@ class LiveNode:
         """Decide whether a release of a gated node may tick."""
         if self.retired:
             return Admission.END
-        if self.held:
+        if self.standing.held:
             return Admission.SKIP
         if self.state is NodeState.RESTARTING:
             waited = self.timeline.now_ns() >= self._restart_at_ns
@@ -421,7 +413,7 @@ class LiveNode:
     @property
     def reported_state(self) -> NodeState:
         """The state as people see it: a node that is held says so."""
-        return NodeState.SAFE_STATE if self.held and self.initialized else self.state
+        return NodeState.SAFE_STATE if self.standing.held and self.initialized else self.state
 
     @property
     def owed_from_ns(self) -> int:
@@ -431,11 +423,6 @@ class LiveNode:
         waits for its predecessors is bounded and by design, however short a timeout.
         """
         return max(self.timeline.epoch_ns, self._restart_at_ns, self.waited_until_ns)
-
-    @property
-    def has_hook(self) -> bool:
-        """Whether there is a safe-state hook."""
-        return self.callbacks["safe_state"] is not None
 
     def frozen_for(self, limit_ns: int) -> bool:
         """Return whether a tick, or `init()` in its place, has been running for longer.
@@ -455,10 +442,11 @@ class LiveNode:
 
         Thread: that which ticks the node, or releases it.
         """
-        if self.critical_ns is None or self.held or self.health is not Health.HEALTHY:
+        standing, critical_ns = self.standing, self.critical_ns
+        if critical_ns is None or standing.held or standing.health is not Health.HEALTHY:
             return
         lasted_ns = now_ns - max(since_ns, self.tick_context.finish_ns, self.owed_from_ns)
-        if lasted_ns > self.critical_ns:
+        if lasted_ns > critical_ns:
             self.control.critical_late(self, lasted_ns)
 
     def skip_late(self, count: int, since_ns: int, now_ns: int) -> None:
@@ -469,110 +457,26 @@ class LiveNode:
         self.counters.skipped += count
         self.check_critical(since_ns, now_ns)
 
-    def expire(self, health: Health) -> None:
-        """Take note that the watchdog has run out.
-
-        Thread: supervisor.
-        """
-        with self._claims:
-            self._expire(health)
-
-    def _expire(self, health: Health) -> None:
-        if self.health is Health.HEALTHY:
-            self.counters.watchdog_expirations += 1
-        self.health = health
-        self.alert = True
-
-    def expired_unseen(self) -> None:
-        """Take note that the watchdog would have run out, had anybody looked.
-
-        Thread: supervisor.
-        """
-        with self._claims:
-            self.counters.watchdog_expirations += 1
-
-    def recovered(self) -> bool:
-        """Return to health, because the tick has ended; return whether that is news.
-
-        An isolated node stays isolated.
-
-        Thread: the node's, or the supervisor.
-        """
-        with self._claims:
-            if self.health in (Health.HEALTHY, Health.ISOLATED):
-                return False
-            self.health = Health.HEALTHY
-        return True
-
-    def isolate(self, ticks: int) -> bool:
-        """Take the node out of the schedule, unless the tick in question has ended meanwhile.
-
-        Args:
-            ticks: The count of ticks when it was found frozen.
-
-        Thread: supervisor.
-        """
-        with self._claims:
-            if self.counters.ticks != ticks:
-                return False
-            self._expire(Health.ISOLATED)
-            if not self.held:
-                self._hold()
-        return True
-
-    def hold(self) -> bool:
-        """Let the node tick no more until `free`; return whether it did until now.
-
-        Thread: supervisor.
-        """
-        with self._claims:
-            if self.held:
-                return False
-            self._hold()
-        return True
-
-    def _hold(self) -> None:
-        # `held` first: whoever opens the gate looks at it afterwards.
-        self.held = True
-        self.gated = True
-        self.holds += 1
-
-    def claim_hook(self) -> bool:
-        """Return whether there is a safe-state hook to call; who hears yes must call it.
-
-        And say when it has returned, with `hook_returned` or `safe_state_entered`.
-        Meanwhile nobody else does.
-
-        Thread: any.
-        """
-        with self._claims:
-            if not (self.has_hook and self.hook_returned.is_set()):
-                return False
-            self.hook_returned.clear()
-        return True
-
     def safe_state_entered(self) -> None:
         """Take note that the hook has returned that a tick has led to: the tick is over.
 
         Thread: the node's.
         """
-        self.hook_returned.set()
+        self.standing.hook_returned.set()
         self.tick_context.finish_ns = self.timeline.now_ns()
         self.tick_context.ticking = False
 
     def free(self) -> None:
         """Let the node tick again, not isolated any more.
 
-        A tick that lasts too long already goes on doing so.
-
         Thread: any.
         """
-        with self._claims:
-            self.held = False
-            if self.health is Health.ISOLATED:
-                self.health = Health.HEALTHY
+        self.standing.let_go()
         self.in_episode = False
         self.regate()
+
+    def _close_gate(self) -> None:
+        self.gated = True
 
 
 class _Nobody:

@@ -185,7 +185,7 @@ class Oversight:
         self._hooks.call(
             live
             for live in reversed(self._registry.in_order)
-            if live.state in alive and live.hold() and live.claim_hook()
+            if live.state in alive and live.standing.hold() and live.standing.claim_hook()
         )
 
     def _shut_down(self) -> None:

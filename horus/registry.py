@@ -60,7 +60,7 @@ class Registry:
         """Get every node ready for `init()`: a session opens."""
         with self._lock:
             for name, live in self._by_name.items():
-                if live.abandoned or not live.hook_returned.is_set():
+                if live.abandoned or not live.standing.hook_returned.is_set():
                     self._by_name[name] = live.successor()
                 else:
                     live.renew()
@@ -111,7 +111,7 @@ class Registry:
             "watchdog_expirations": sum(each.watchdog_expirations for each in counters),
             "skipped": sum(each.skipped for each in counters),
             "order_violations": sum(each.order_violations for each in counters),
-            "health_states": {live.name: live.health.value for live in self.in_order},
+            "health_states": {live.name: live.standing.health.value for live in self.in_order},
         }
 
     def _sort(self) -> None:
@@ -153,7 +153,7 @@ def node_stats(live: LiveNode, now_ns: int) -> dict[str, Any]:
         "achieved_rate": timing.achieved_hz,
         "priority": live.spec.priority,
         "state": live.reported_state.value,
-        "health": live.health.value,
+        "health": live.standing.health.value,
         "total_ticks": counters.ticks,
         "errors_count": counters.errors,
         "restarts": counters.restarts,

@@ -120,6 +120,7 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException |
     context = live.tick_context
     counters = live.counters
     add_times = counters.times.add
+    standing = live.standing
 
     def finish(release_ns: int, start_ns: int, limits: Limits, error: BaseException | None) -> bool:
         finish_ns = now_ns()
@@ -134,7 +135,7 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException |
             over_budget_ns > 0
             or finish_ns - release_ns > limits[2]
             or error is not None
-            or live.alert
+            or standing.alert
         ):
             return _settle(live, release_ns, finish_ns, limits, over_budget_ns, error)
         context.finish_ns = finish_ns
@@ -172,7 +173,8 @@ def _settle(
         failure_policy=live.spec.failure_policy,
         in_episode=live.in_episode,
     )
-    live.in_episode = live.alert = outcome.missed
+    standing = live.standing
+    live.in_episode = standing.alert = outcome.missed
     if error is not None:
         live.tick_failed(error)
     if outcome.over_budget_ns:
@@ -182,17 +184,17 @@ def _settle(
         live.control.count_miss()
     _act(live, limits, outcome, action, error)
     # Not if the supervisor has called the hook, or is about to.
-    enter_safe_state = action.enter_safe_state and not live.held and live.claim_hook()
+    enter_safe_state = action.enter_safe_state and not standing.held and standing.claim_hook()
     context.ticking = enter_safe_state
-    if live.health is not Health.HEALTHY:
+    if standing.health is not Health.HEALTHY:
         _tell_that_it_ended(live)
     return enter_safe_state
 
 
 def _tell_that_it_ended(live: LiveNode) -> None:
-    if live.recovered():
+    if live.standing.recovered():
         live.emit(logging.INFO, "healthy again")
-    elif live.health is Health.ISOLATED:
+    elif live.standing.health is Health.ISOLATED:
         live.emit(
             logging.WARNING, "its frozen tick has ended; clear_safe_state() lets it tick again"
         )

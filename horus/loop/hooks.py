@@ -80,7 +80,7 @@ class HookCaller:
 
     def _call_one(self, live: LiveNode, owed: Callable[[LiveNode], bool]) -> None:
         if not owed(live):
-            live.hook_returned.set()
+            live.standing.hook_returned.set()
             return
 
         def run() -> None:
@@ -89,7 +89,7 @@ class HookCaller:
             try:
                 self._run(live)
             finally:
-                live.hook_returned.set()
+                live.standing.hook_returned.set()
 
         asker = threading.current_thread()
         thread = _run_aside(run, f"horus-safe-state:{live.name}")
@@ -139,7 +139,7 @@ def _tick_ends(live: LiveNode, timeout_s: float) -> bool:
     """Wait for the end of a healthy tick; return whether there is none (any more)."""
     nap = threading.Event()
     for _ in range(round(timeout_s * 1000)):
-        if not (live.ticking and live.health is Health.HEALTHY):
+        if not (live.ticking and live.standing.health is Health.HEALTHY):
             return True
         nap.wait(0.001)
     return False

@@ -74,7 +74,7 @@ class Inspector:
         """
         if live.critical_ns is None:
             return
-        live.expired_unseen()
+        live.standing.expired_unseen()
         reason = (
             f"critical node {live.name} was owed a tick for {readable(lasted_ns)}, longer than "
             f"its limit of {readable(live.critical_ns)}, before anybody could look"
@@ -84,7 +84,7 @@ class Inspector:
 
     def _act(self, finding: Finding) -> None:
         live, health = finding.live, finding.health
-        before = live.health
+        before = live.standing.health
         if finding.critical and health is Health.HEALTHY:
             health = Health.WARNING
         news = health is not before or health is Health.HEALTHY
@@ -96,7 +96,7 @@ class Inspector:
                 return
             finding.home.isolate(live)
         elif health is not before:
-            live.expire(health)
+            live.standing.expire(health)
         entered: str | None = None
         if live.critical_ns is not None and (finding.critical or isolated):
             reason = (

@@ -65,7 +65,7 @@ class Pace:
                 counters.ticks,
                 counters.skipped,
                 counters.times.execution_total_ns,
-                live.holds + counters.watchdog_expirations + counters.restarts,
+                live.standing.holds + counters.watchdog_expirations + counters.restarts,
             )
             window = before.get(live)
             if window is None or window.interruptions != present.interruptions:
@@ -93,9 +93,9 @@ def _is_asked_to_tick(live: LiveNode) -> bool:
     return (
         live.trigger is None
         and live.state is NodeState.RUNNING
-        and live.health is Health.HEALTHY
+        and live.standing.health is Health.HEALTHY
         and live.spec.on_miss is not Miss.SKIP
-        and not (live.held or live.retired)
+        and not (live.standing.held or live.retired)
     )
 
 

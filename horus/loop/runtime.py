@@ -373,7 +373,7 @@ class Runtime:
             begin()
 
         def shut_down(_: object) -> None:
-            if live.hook_returned.is_set():
+            if live.standing.hook_returned.is_set():
                 begin()
             else:
                 self._post(lambda: self._spawn(begin_after_hook()))

@@ -69,10 +69,11 @@ class Safety:
             live: The node.
             ticks: Its count of ticks when it was found frozen.
         """
-        held_already = live.held
-        if not live.isolate(ticks):
+        standing = live.standing
+        held_already = standing.held
+        if not standing.isolate(ticks):
             return False
-        if not held_already and live.claim_hook():
+        if not held_already and standing.claim_hook():
             self._call_hooks([live])
         return True
 
@@ -89,18 +90,19 @@ class Safety:
         self._refuse_if_frozen(lives)
         for live in lives:
             # Hooks that have just been called have the time that they are given anyway.
-            live.hook_returned.wait(HOOK_TIMEOUT_S)
+            live.standing.hook_returned.wait(HOOK_TIMEOUT_S)
         remain = []
         with self._lock:
             # Again: one that froze meanwhile has found the safe state active.
             self._refuse_if_frozen(lives)
-            news = self.active or any(live.held for live in lives)
+            news = self.active or any(live.standing.held for live in lives)
             self.reason = None
             for live in lives:
-                frozen = live.health is Health.ISOLATED and live.busy
-                if live.held and (frozen or not live.hook_returned.is_set()):
+                standing = live.standing
+                frozen = standing.health is Health.ISOLATED and live.busy
+                if standing.held and (frozen or not standing.hook_returned.is_set()):
                     remain.append(live.name)
-                elif live.held:
+                elif standing.held:
                     live.free()
         if news:
             still = f"; still held: {', '.join(remain)}" if remain else ""
@@ -120,8 +122,9 @@ class Safety:
 
     def _hold(self, lives: Iterable[LiveNode]) -> list[LiveNode]:
         """Hold nodes that have a hook; return those whose hook is to be called."""
-        held = [live for live in lives if live.has_hook and live.initialized and live.hold()]
-        return [live for live in held if live.claim_hook()]
+        able = (live for live in lives if live.standing.has_hook and live.initialized)
+        held = [live for live in able if live.standing.hold()]
+        return [live for live in held if live.standing.claim_hook()]
 
     def _call(self, owed: list[LiveNode]) -> None:
         if owed:
@@ -132,4 +135,5 @@ def _is_critical_and_frozen(live: LiveNode) -> bool:
     if live.critical_ns is None:
         return False
     # By its health if it is due and cannot begin.
-    return live.health in (Health.WARNING, Health.UNHEALTHY) or live.frozen_for(live.critical_ns)
+    late = live.standing.health in (Health.WARNING, Health.UNHEALTHY)
+    return late or live.frozen_for(live.critical_ns)

@@ -94,7 +94,7 @@ def shut_down_without_loop(
 async def hook_over(live: LiveNode) -> None:
     """Wait for a node's safe-state hook, for as long as others do."""
     for _ in range(round(HOOK_TIMEOUT_S * 1000)):
-        if live.hook_returned.is_set():
+        if live.standing.hook_returned.is_set():
             return
         await asyncio.sleep(0.001)
 

@@ -256,7 +256,7 @@ class Simulation(Stepper):
         for live in lives:
             if not live.is_async:
                 live.context.copy().run(live.run_phase, "safe_state")
-                live.hook_returned.set()
+                live.standing.hook_returned.set()
                 continue
             task = self._virtual_loop().loop.create_task(
                 live.run_phase_async("safe_state"),
@@ -309,4 +309,4 @@ class Simulation(Stepper):
 
 
 def _hook_returned(live: LiveNode, _: object) -> None:
-    live.hook_returned.set()
+    live.standing.hook_returned.set()

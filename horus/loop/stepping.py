@@ -171,7 +171,7 @@ class Stepper:
         """Call `shutdown()` of a node, if it is initialised, after its safe-state hook."""
         live.leave_service()
         if not self.timeline.deterministic:
-            live.hook_returned.wait(HOOK_TIMEOUT_S)
+            live.standing.hook_returned.wait(HOOK_TIMEOUT_S)
         if live.claim_shutdown():
             self.run_phase(live, "shutdown")
             live.stopped()

@@ -149,7 +149,8 @@ class Supervisor:
 
     def _is_well(self) -> bool:
         critical = (live for live in self._watchdog.watched() if live.critical_ns is not None)
-        return not self._safety.active and all(live.health is Health.HEALTHY for live in critical)
+        healthy = all(live.standing.health is Health.HEALTHY for live in critical)
+        return healthy and not self._safety.active
 
 
 async def _collect_garbage() -> None:

@@ -103,7 +103,7 @@ class Watchdog:
             timeout_ns = self.timeout_of(live)
             if not timeout_ns or not live.initialized:
                 continue
-            if live.health is Health.ISOLATED:
+            if live.standing.health is Health.ISOLATED:
                 # It may be let go right after this look.
                 self._look_again_at(now_ns + min(timeout_ns, live.critical_ns or FOREVER_NS))
                 continue
@@ -133,7 +133,7 @@ class Watchdog:
         recovered = False
         if began_ns != vigil.began_ns:
             self._vigils[live] = vigil = _Vigil(began_ns)
-            recovered = live.recovered()
+            recovered = live.standing.recovered()
         # A tick that is new to us may have begun at any time since we were to look.
         unseen_ns = min(late_ns, now_ns - began_ns)
         if unseen_ns > 0 and late_ns > timeout_ns // 4 and began_ns != NEVER:
@@ -160,10 +160,10 @@ class Watchdog:
         critical = lasted_ns > critical_ns
         # Another tick may begin right after this look.
         self._look_again_at((now_ns if critical else since_ns) + critical_ns + 1)
-        worse = GRADES.index(health) > GRADES.index(live.health)
+        worse = GRADES.index(health) > GRADES.index(live.standing.health)
         if not (worse or critical or recovered):
             return None
-        health = health if worse else live.health
+        health = health if worse else live.standing.health
         return Finding(live, home, health, critical, lasted_ns, running, ticks, blamed)
 
     def _look_again_at(self, instant_ns: int) -> None:

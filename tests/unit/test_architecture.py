@@ -15,7 +15,7 @@ LAYERS = [
     ["units", "errors"],
     ["timing", "validation", "os_rt"],
     ["ports", "callables", "spec", "stats", "ratelimit"],
-    ["clock", "logs", "snapshot"],
+    ["clock", "logs", "snapshot", "standing"],
     ["topics", "graph", "escalation", "stream", "reports"],
     ["core"],
     ["node", "live"],

@@ -31,9 +31,9 @@ class Hooks:
 
     def __call__(self, lives: Sequence[LiveNode]) -> None:
         for live in lives:
-            assert live.held
+            assert live.standing.held
             self.called.append(live.name)
-            live.hook_returned.set()
+            live.standing.hook_returned.set()
 
 
 def test_all_are_held_before_the_first_hook_is_called() -> None:
@@ -50,7 +50,7 @@ def test_all_are_held_before_the_first_hook_is_called() -> None:
     assert not safety.enter("again", lambda: lives)
 
     assert hooks.called == ["c", "a", "b"]
-    assert [live.held for live in lives] == [True, True, True, False]
+    assert [live.standing.held for live in lives] == [True, True, True, False]
     assert safety.reason == "because"
 
 
@@ -60,7 +60,7 @@ def test_a_node_that_comes_at_that_moment_is_held() -> None:
     safety = Safety(hooks)
     before, late = make_live("before", 0), make_live("late", 1)
     safety.join(before)
-    assert not before.held
+    assert not before.standing.held
 
     def members() -> list[LiveNode]:
         assert safety.active
@@ -69,8 +69,8 @@ def test_a_node_that_comes_at_that_moment_is_held() -> None:
     safety.enter("because", members)
     safety.join(late)
 
-    assert before.held
-    assert late.held
+    assert before.standing.held
+    assert late.standing.held
     assert hooks.called == ["before", "late"]
 
 
@@ -82,8 +82,8 @@ def test_a_tick_that_has_ended_is_not_isolated() -> None:
     live.counters.ticks = 5
 
     assert not safety.isolate(live, 4)
-    assert not live.held
+    assert not live.standing.held
     assert hooks.called == []
     assert safety.isolate(live, 5)
-    assert live.held
+    assert live.standing.held
     assert hooks.called == ["a"]

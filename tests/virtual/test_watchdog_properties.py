@@ -189,7 +189,7 @@ def test_the_safe_state_is_entered_once_per_episode(ticks):
         if clears:
             world.safety.clear([world.live])
 
-    assert world.live.held is world.safety.active
+    assert world.live.standing.held is world.safety.active
 
 
 # -- supervision that comes late -------------------------------------------------------------------

@@ -56,7 +56,7 @@ class World:
     @property
     def health(self) -> Health:
         """What supervision thinks of the node."""
-        return self.live.health
+        return self.live.standing.health
 
     @property
     def expirations(self) -> int:
@@ -113,7 +113,7 @@ class World:
     def _call_hooks(self, lives: Iterable[LiveNode]) -> None:
         for live in lives:
             live.context.copy().run(live.run_phase, "safe_state")
-            live.hook_returned.set()
+            live.standing.hook_returned.set()
 
     # -- the node's home ---------------------------------------------------------------
 
