@@ -16,6 +16,10 @@ from horus import Scheduler
 
 _GRACE_S = 2.0
 
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell starts what it runs in the background so, and the tests' programs would be deaf, too.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 def _threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.is_alive()}
