@@ -8,6 +8,7 @@ from collections import deque
 from horus import clock
 from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
+from horus.loop.cycle import Cycle
 from horus.loop.realtime import RealTime
 from horus.tick_path import build_tick
 from horus.units import NS_PER_US
@@ -224,9 +225,10 @@ class RtThread(NodeThread):
 class RtExecutor(ThreadExecutor[RtThread]):
     """Gives every node an `RtThread`."""
 
-    def __init__(self, real_time: RealTime) -> None:
-        """Serve the nodes of one run."""
+    def __init__(self, cycle: Cycle, real_time: RealTime) -> None:
+        """Serve the nodes of one run; `cycle` is to give way to them."""
         super().__init__()
+        self._cycle = cycle
         self._real_time = real_time
         self._in_order: list[RtThread] = []
 
@@ -269,6 +271,7 @@ class RtExecutor(ThreadExecutor[RtThread]):
         thread.post(thread.retime)
 
     def _introduce(self) -> None:
-        """Tell every engaged thread whom it follows."""
+        """Tell every engaged thread whom it follows, and the loop whether there are any."""
         for place, thread in enumerate(self._in_order):
             thread.predecessors = tuple(reversed(self._in_order[:place]))
+        self._cycle.gives_way = bool(self._in_order)

@@ -10,6 +10,9 @@ from horus.live import LiveNode
 from horus.loop.releases import ReleaseQueue
 from horus.loop.ticker import Ticker
 
+GIVE_WAY_NS = 100_000
+"""How much later the loop turns to its releases than Rt nodes to theirs [ns]: measured."""
+
 Dispatch = Callable[[LiveNode, int], None]
 """Starts a tick of a node for a release [ns]: inline, as a task, or on another thread."""
 
@@ -26,7 +29,8 @@ class Cycle:
         arm the ticker for the earliest release
 
     What becomes due meanwhile waits for the next turn, so that the loop's other
-    work gets one in between.
+    work gets one in between. And while Rt nodes run, the loop gives way: woken at the
+    same instant, it would take the interpreter from them.
 
     Thread: loop.
     """
@@ -38,6 +42,8 @@ class Cycle:
         self._releases = ReleaseQueue()
         self._dispatch: dict[LiveNode, Dispatch] = {}
         self._ticker = Ticker(loop, self.run_due)
+        self.gives_way = False
+        """Whether there are Rt nodes to give way to."""
 
     def run_due(self) -> None:
         """Dispatch every release that is due; see the class for the steps."""
@@ -82,6 +88,8 @@ class Cycle:
         self._ticker.close()
 
     def _arm(self) -> None:
-        next_ns = self._releases.next_ns
-        if next_ns is not None and next_ns < self._timeline.end_ns:
-            self._ticker.arm(next_ns)
+        next_ns, end_ns = self._releases.next_ns, self._timeline.end_ns
+        if next_ns is None or next_ns >= end_ns:
+            return
+        give_way = self.gives_way and next_ns + GIVE_WAY_NS < end_ns
+        self._ticker.arm(next_ns + GIVE_WAY_NS if give_way else next_ns)

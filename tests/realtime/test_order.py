@@ -7,7 +7,8 @@ import time
 import pytest
 
 import horus
-from horus import Node, Scheduler
+from horus import Node, Scheduler, clock
+from horus.loop.cycle import GIVE_WAY_NS
 
 pytestmark = [pytest.mark.realtime, pytest.mark.usefixtures("leaves_nothing_behind")]
 
@@ -86,3 +87,21 @@ def test_a_frozen_predecessor_is_isolated_not_contagious() -> None:
     # The predecessor was away for some 200 of the motor's releases.
     assert 100 <= stats["order_violations"] <= 400
     assert watch.out_of_order <= stats["order_violations"]
+
+
+def test_the_loop_gives_way_to_rt_nodes() -> None:
+    """Woken at the same instant, it would take the interpreter from them."""
+    late_ns: list[int] = []
+
+    def log() -> None:
+        context = clock.current.get()
+        assert context is not None
+        late_ns.append(time.monotonic_ns() - context.release_ns)
+
+    scheduler = Scheduler()
+    scheduler.add(Node("logger", log))
+    scheduler.add(Node("motor", lambda: None, rate=100))
+    scheduler.run(0.5)
+
+    assert len(late_ns) > 5
+    assert min(late_ns[1:]) >= GIVE_WAY_NS  # the first one may be asked for before there is a motor

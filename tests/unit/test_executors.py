@@ -15,7 +15,11 @@ NOTHING_DUE = Mock(due_ns=Mock(return_value=None))
 
 @pytest.mark.parametrize(
     "executor",
-    [RtExecutor(Mock()), ThreadEventExecutor(Mock()), ComputeExecutor(Mock(), NOTHING_DUE, Mock())],
+    [
+        RtExecutor(Mock(), Mock()),
+        ThreadEventExecutor(Mock()),
+        ComputeExecutor(Mock(), NOTHING_DUE, Mock()),
+    ],
     ids=["Rt", "Event", "Compute"],
 )
 def test_a_dismissed_node_owes_nothing(executor):
