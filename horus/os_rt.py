@@ -91,6 +91,15 @@ def run_fifo(priority: int, *, inherited: bool = False) -> None:
     os.sched_setscheduler(0, policy, os.sched_param(priority))
 
 
+def change_fifo(priority: int) -> None:
+    """Change the SCHED_FIFO priority of the calling thread, 1 to 99.
+
+    Raises:
+        OSError: Not permitted.
+    """
+    os.sched_setparam(0, os.sched_param(priority))
+
+
 def run_first() -> None:
     """Let the calling thread run before all others of ordinary scheduling: nice -20.
 

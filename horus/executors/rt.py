@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections import deque
 
-from horus import clock
+from horus import clock, os_rt
 from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
 from horus.loop.cycle import Cycle
@@ -43,14 +44,20 @@ class RtThread(NodeThread):
 
     def __init__(self, live: LiveNode, real_time: RealTime) -> None:
         """Prepare a thread that does not release yet."""
-        super().__init__(live, functools.partial(real_time.enter_node_thread, live))
+        super().__init__(live, self._enter_real_time)
         self.engaged = False
+        self.priority: int | None = None
+        """The SCHED_FIFO priority that the thread was granted; None for ordinary scheduling."""
+        self.priority_after: int | None = None
+        """The highest priority of those that follow this node in execution order."""
         self.predecessors: tuple[RtThread, ...] = ()
         """The engaged nodes before this one in execution order, the nearest first."""
         self.done_ns = clock.NEVER
         """The release of the last tick that is over [ns]: a skipped one frees nobody."""
         self.grid = live.grid()
         self._waiting: deque[RtThread] = deque()
+        self._inherited = False
+        self._real_time = real_time
         self._run_tick = build_tick(live)
         self._timeline = live.timeline
         self._now_ns = live.timeline.now_ns
@@ -93,8 +100,8 @@ class RtThread(NodeThread):
                 self._skip_to(latest)
                 return
         self._run_tick(release_ns)
+        self._hand_over(release_ns)
         self._move_to(self._index + 1)
-        self._pass_baton(release_ns)
 
     def engage(self, from_ns: int) -> None:
         """Begin with the first release at or after `from_ns` [ns].
@@ -208,18 +215,49 @@ class RtThread(NodeThread):
             self._violated_ns = release_ns
             self.live.order_violated(predecessor.live)
 
+    def _enter_real_time(self) -> None:
+        self.priority = self._real_time.enter_node_thread(self.live)
+
+    def park(self, timeout_ns: int | None = None) -> bool:
+        """Sleep; see `NodeThread`. What `_hand_over` has raised ends with it."""
+        woken = super().park(timeout_ns)
+        if self._inherited:
+            self._inherited = False
+            self._change_priority(self.priority)
+        return woken
+
+    def _hand_over(self, done_ns: int) -> None:
+        """Pass the baton; until it sleeps, this thread inherits the priority of those after it.
+
+        They share a core as a rule. Woken with a higher priority, one would preempt this
+        thread at once, find the interpreter taken, and go back to sleep for it.
+        """
+        after = self.priority_after
+        if self._waiting and after is not None and (self.priority or after) < after:
+            self._inherited = True
+            self._change_priority(after)
+        self._pass_baton(done_ns)
+
+    def _change_priority(self, priority: int | None) -> None:
+        if priority is not None:
+            with contextlib.suppress(OSError):
+                os_rt.change_fifo(priority)
+
     def _pass_baton(self, done_ns: int) -> None:
         """Let those run that wait for this node.
 
         Thread: the node's, or supervision.
         """
         self.done_ns = done_ns
-        while self._waiting:
+        for _ in range(len(self._waiting)):
             try:
                 waiting = self._waiting.popleft()
             except IndexError:  # the other one has taken it
                 return
-            waiting.unpark()
+            if waiting._release_ns <= done_ns:
+                waiting.unpark()
+            elif waiting.engaged:
+                self._waiting.append(waiting)  # for a later release: let it sleep
 
 
 class RtExecutor(ThreadExecutor[RtThread]):
@@ -272,6 +310,11 @@ class RtExecutor(ThreadExecutor[RtThread]):
 
     def _introduce(self) -> None:
         """Tell every engaged thread whom it follows, and the loop whether there are any."""
-        for place, thread in enumerate(self._in_order):
+        highest: int | None = None
+        for place in reversed(range(len(self._in_order))):
+            thread = self._in_order[place]
             thread.predecessors = tuple(reversed(self._in_order[:place]))
+            thread.priority_after = highest
+            if thread.priority is not None:
+                highest = max(highest or 0, thread.priority)
         self._cycle.gives_way = bool(self._in_order)

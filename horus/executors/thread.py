@@ -30,7 +30,7 @@ class NodeThread(threading.Thread):
     Thread: any for `post`, `call` and `close`; the others are the thread's own.
     """
 
-    def __init__(self, live: LiveNode, enter: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, live: LiveNode, enter: Callable[[], object] = lambda: None) -> None:
         """Prepare a thread for `live`, which begins with `enter`; it runs from `start()` on."""
         super().__init__(name=f"horus:{live.name}", daemon=True)
         self.live = live

@@ -82,8 +82,12 @@ class RealTime:
         by_rate = _LOWEST_PRIORITY + round(10 * math.log10(live.spec.rate_hz))
         return min(max(by_rate, _LOWEST_PRIORITY), _HIGHEST_PRIORITY)
 
-    def enter_node_thread(self, live: LiveNode) -> None:
-        """Give a node's thread its core, its priority and exact sleeps; it ends with the run."""
+    def enter_node_thread(self, live: LiveNode) -> int | None:
+        """Give a node's thread its core, its priority and exact sleeps; it ends with the run.
+
+        Returns:
+            The SCHED_FIFO priority that was granted; None for ordinary scheduling.
+        """
         cores = self._cores_of(live)
         if cores is not None:
             self._pin(cores, f"node {live.name!r}")
@@ -97,8 +101,10 @@ class RealTime:
                     self.degrade(f"SCHED_FIFO unavailable ({reason}) - using SCHED_OTHER")
                 else:
                     self.degrade(f"node {live.name!r}: priority {priority} refused ({reason})")
+                priority = None
         with contextlib.suppress(OSError):
             os_rt.set_timer_slack(_TIMER_SLACK_NS)
+        return priority
 
     def enter_worker_thread(self, live: LiveNode) -> None:
         """Give a compute node's thread its cores; under `rt=True`, see that it is not preempted.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 
 import pytest
@@ -105,3 +106,25 @@ def test_the_loop_gives_way_to_rt_nodes() -> None:
 
     assert len(late_ns) > 5
     assert min(late_ns[1:]) >= GIVE_WAY_NS  # the first one may be asked for before there is a motor
+
+
+def test_who_hands_over_to_a_higher_priority_has_its_own_again_in_its_next_tick() -> None:
+    """Priority inheritance ends with the hand-over; nobody preempts a thread on its way to it."""
+    priorities: list[int] = []
+    after: list[int] = []
+    scheduler = Scheduler(rt=True)
+    if not scheduler.capabilities()["rt_scheduling"]:
+        pytest.skip("SCHED_FIFO is not permitted")
+
+    def track() -> None:
+        priorities.append(os.sched_getparam(0).sched_priority)
+
+    def drive() -> None:
+        after.append(os.sched_getparam(0).sched_priority)
+
+    scheduler.add(Node("tracker", track, rate=50, order=0))
+    scheduler.add(Node("motor", drive, rate=500, order=1))
+    scheduler.run(0.5)
+
+    assert len(priorities) > 10
+    assert max(priorities) == min(priorities) < min(after)

@@ -1,4 +1,4 @@
-"""What the supervisor asks of a node that has just been taken out of the schedule."""
+"""What executors decide, without a run."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ from unittest.mock import Mock
 
 import pytest
 
+from horus import Node
+from horus.clock import SimClock, Timeline
 from horus.executors.compute import ComputeExecutor
 from horus.executors.event import ThreadEventExecutor
-from horus.executors.rt import RtExecutor
+from horus.executors.rt import RtExecutor, RtThread
+from horus.live import LiveNode
+from horus.loop.control import RunControl
 
 NOTHING_DUE = Mock(due_ns=Mock(return_value=None))
 
@@ -29,3 +33,24 @@ def test_a_dismissed_node_owes_nothing(executor):
     assert executor.due_ns(gone, 10**9) is None
     assert executor.thread_id(gone) is None
     executor.isolate(gone)
+
+
+def test_the_baton_wakes_only_those_whose_turn_it_is():
+    """A tracker at 100 Hz sleeps through nine of ten ticks of the safety monitor at 1 kHz."""
+    control = RunControl(None, lambda live, lasted_ns: None)
+    timeline = Timeline(SimClock(), 1000.0)
+    safety, tracker = (
+        RtThread(
+            LiveNode(Node(name, lambda: None, rate=1000), timeline, control, place), Mock(spin_ns=0)
+        )
+        for place, name in enumerate(("safety", "tracker"))
+    )
+    tracker.engage(10_000_000)
+    tracker.park(0)
+    safety._waiting.append(tracker)
+
+    safety._pass_baton(9_000_000)
+    assert not tracker.park(0)
+    safety._pass_baton(10_000_000)
+    assert tracker.park(0)
+    assert not safety._waiting
