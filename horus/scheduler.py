@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from horus import unavailable
+from horus import embedding, unavailable
 from horus.core import NodeCore, core_of
 from horus.errors import ConfigError, StateError
 from horus.loop.realtime import capabilities
@@ -21,7 +21,8 @@ from horus.spec import make_scheduler_spec
 from horus.stats import TimingReport
 from horus.stream import MessageStream
 from horus.topics import Publisher
-from horus.validation import check_duration, check_topic, optional_duration
+from horus.units import to_s
+from horus.validation import check_count, check_duration, check_topic, optional_duration
 
 _APPLICATION = "application"
 
@@ -322,6 +323,28 @@ class Scheduler:
             self.stop()
             await background
 
+    async def started(self) -> None:
+        """Wait until every node of the run, or of the next one, is initialised and may tick.
+
+        Raises:
+            StateError: The run ended before; its reason is in the message.
+
+        Thread: that of an asyncio event loop, whichever runs the nodes.
+        """
+        await embedding.started(self._session)
+
+    async def wait_node(self, name: str, ticks: int = 1) -> None:
+        """Wait until a node has completed `ticks` ticks in all, as in its `total_ticks`.
+
+        Raises:
+            UnknownNodeError: There is no such node, or it was removed.
+            ConfigError: `ticks` is no whole number above 0.
+            StateError: The run ended before, or the node's `init()` failed.
+
+        Thread: that of an asyncio event loop, whichever runs the nodes.
+        """
+        await embedding.ticked(self._session, name, check_count("ticks", ticks, least=1))
+
     # -- topics, for the application -------------------------------------------------
 
     def publish(self, topic: str | type, message: Any) -> None:
@@ -350,6 +373,32 @@ class Scheduler:
         """
         subscription = self._bus.subscribe(topic, _APPLICATION, capacity)
         return self._session.open_stream(subscription)
+
+    async def request(
+        self, topic: str | type, message: Any, *, reply: str | type, timeout: float | None = None
+    ) -> Any:
+        """Send a message and return the first one that is then sent on the topic `reply`.
+
+        There is nothing in it that ties the two together: with several who ask at once,
+        put a number into the message that the answer repeats, and use `subscribe`.
+
+        Args:
+            topic: Where to send it.
+            message: What to send.
+            reply: Where the answer comes.
+            timeout: How long to wait [s]; None for as long as the run goes on.
+
+        Raises:
+            TimeoutError: There was no answer in time.
+            TopicError: A topic or the message was refused.
+            StateError: The run ended before.
+
+        Thread: that of an asyncio event loop, whichever runs the nodes.
+        """
+        timeout_ns = optional_duration("timeout", timeout)
+        with self.subscribe(reply) as replies:
+            self.publish(topic, message)
+            return await embedding.answer(replies, None if timeout_ns is None else to_s(timeout_ns))
 
     # -- introspection ----------------------------------------------------------------
 

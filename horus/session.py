@@ -58,6 +58,12 @@ class Session:
         self.oversight = Oversight(spec, self.timeline, self.registry, self._drivers)
         self.control = RunControl(spec.max_deadline_misses, self.oversight.critical_late)
         self.status = "idle"
+        self.started = False
+        """Whether all nodes of the present run are initialised and may tick."""
+        self.runs_started = 0
+        """How many runs, this one included, came so far that all nodes could tick."""
+        self.runs_ended = 0
+        """How many runs have ended."""
         self._lock = threading.Lock()
         self._open = False
         self._closing = False
@@ -260,6 +266,8 @@ class Session:
                 self._close()
         finally:
             self.status = "idle" if self._open else "stopped"
+            self.started = False
+            self.runs_ended += 1
 
     def _close(self) -> None:
         """Shut down what is still initialised; the next run begins with `init()` again."""
@@ -326,6 +334,9 @@ class Session:
         return Simulation(self.timeline, self._sim_clock, self._stopping, safety, inspector)
 
     def _ready(self) -> None:
+        if not self.control.stopping:
+            self.started = True
+            self.runs_started += 1
         self.oversight.tell_manager("READY=1")
 
     def _simulate(self, duration_ns: int | None, only: list[LiveNode] | None) -> None:

@@ -34,6 +34,11 @@ class MessageStream:
         subscription.wake = self._wake
 
     @property
+    def topic(self) -> str:
+        """The topic's name."""
+        return self._subscription.topic.name
+
+    @property
     def dropped(self) -> int:
         """How many messages were lost because nobody read them in time."""
         return self._subscription.dropped

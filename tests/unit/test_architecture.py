@@ -25,6 +25,7 @@ LAYERS = [
     ["registry", "unavailable", "drivers"],
     ["oversight"],
     ["session"],
+    ["embedding"],
     ["scheduler"],
     ["__init__"],
 ]
