@@ -349,7 +349,7 @@ def test_hooks_are_called_even_if_the_process_can_have_no_more_threads():
 
 
 def test_a_hook_follows_the_tick_in_progress_and_delays_no_other(make):
-    """A healthy tick of 60 ms ends before its hook begins; the others do not wait for it."""
+    """A healthy tick of 100 ms ends before its hook begins; the others do not wait for it."""
     sched = make()
     freezer = Freezer(armed=False)
     journal, begun = [], threading.Event()
@@ -357,16 +357,16 @@ def test_a_hook_follows_the_tick_in_progress_and_delays_no_other(make):
     def slow(node):
         if freezer.frozen_thread is not None and not begun.is_set():
             begun.set()
-            time.sleep(60 * ms)
+            time.sleep(100 * ms)
             journal.append("command")
 
     def hook(node):
         journal.append(f"hook of {node.name}")
 
-    sched.add(Node("arm", slow, rate=50, compute=True, order=20, safe_state=hook))
+    sched.add(Node("arm", slow, rate=200, compute=True, order=20, safe_state=hook))
     sched.add(Node("motor", nothing, rate=50, order=10, safe_state=hook))
     sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False, watchdog=60.0))
-    sched.add_critical_node("critical", timeout_ms=20)
+    sched.add_critical_node("critical", timeout_ms=60)
     with running(sched), freezer:
         freezer.freeze()
         wait_until(lambda: len(journal) == 3)
