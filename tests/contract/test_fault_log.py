@@ -25,13 +25,14 @@ def hold_the_interpreter(seconds: float) -> None:
     ctypes.PyDLL(None).usleep(int(seconds * 1e6))
 
 
-def once_holding(seconds):
-    """Return a tick that holds the interpreter the first time."""
-    held = []
+def once_holding(seconds, sched):
+    """Return a tick that holds the interpreter once, a few ticks after there is a fault log."""
+    watched_ticks = []
 
     def tick(node):
-        if not held:
-            held.append(1)
+        if sched.fault_log is not None:
+            watched_ticks.append(1)
+        if len(watched_ticks) == 5:
             hold_the_interpreter(seconds)
 
     return tick
@@ -42,8 +43,8 @@ def test_a_tick_that_holds_the_interpreter_leaves_its_stack_in_a_file(make, capl
     sched = make(watchdog_ms=200)
     during = []
     sched.add(Node("other", lambda node: during.append(sched.fault_log), rate=10))
-    sched.add(Node("motor", once_holding(1.8), rate=100))
-    sched.run(duration=2.5)
+    sched.add(Node("motor", once_holding(1.8, sched), rate=100))
+    sched.run(duration=3.0)
 
     assert sched.fault_log is not None
     assert sched.fault_log in during
@@ -129,8 +130,8 @@ def test_a_full_disk_does_not_hide_a_standstill(make, tmp_path, caplog):
     home.mkdir()
     (home / f"scheduler-{os.getpid()}.stacks").symlink_to("/dev/full")
     sched = make(watchdog_ms=100, name="scheduler")
-    sched.add(Node("motor", once_holding(1.6), rate=100))
-    sched.run(duration=2.2)
+    sched.add(Node("motor", once_holding(1.6, sched), rate=100))
+    sched.run(duration=2.7)
 
     assert caplog.text.count("Python stood still for more than 1.00 s") == 1
     assert "could not be written" in caplog.text

@@ -75,8 +75,8 @@ def test_a_slow_predecessor_costs_a_fast_node_no_release() -> None:
     scheduler.run(1.0)
     stats = scheduler.get_node_stats("motor")
     assert len(ticks) > 400
-    # Once for each of the LiDAR's releases, the motor cannot wait for it.
-    assert 20 <= stats["order_violations"] <= 60
+    # The 20 releases that the two share: the motor cannot wait that long for the LiDAR.
+    assert 10 <= stats["order_violations"] <= 20
 
 
 def test_a_frozen_predecessor_is_isolated_not_contagious() -> None:
