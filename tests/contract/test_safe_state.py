@@ -349,15 +349,16 @@ def test_hooks_are_called_even_if_the_process_can_have_no_more_threads():
 
 
 def test_a_hook_follows_the_tick_in_progress_and_delays_no_other(make):
-    """A healthy tick of 100 ms ends before its hook begins; the others do not wait for it."""
+    """A healthy tick in progress ends before its hook begins; the others do not wait for it."""
     sched = make()
     freezer = Freezer(armed=False)
-    journal, begun = [], threading.Event()
+    journal, wanted, begun = [], threading.Event(), threading.Event()
 
     def slow(node):
-        if freezer.frozen_thread is not None and not begun.is_set():
+        if wanted.is_set() and not begun.is_set():
             begun.set()
-            time.sleep(100 * ms)
+            wait_until(lambda: "hook of motor" in journal)
+            time.sleep(30 * ms)
             journal.append("command")
 
     def hook(node):
@@ -368,6 +369,8 @@ def test_a_hook_follows_the_tick_in_progress_and_delays_no_other(make):
     sched.add(freezing_node("Rt", freezer, "critical", order=0, hook=False, watchdog=60.0))
     sched.add_critical_node("critical", timeout_ms=60)
     with running(sched), freezer:
+        wanted.set()
+        assert begun.wait(5)
         freezer.freeze()
         wait_until(lambda: len(journal) == 3)
 
