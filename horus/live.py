@@ -126,6 +126,7 @@ class LiveNode:
         self.standing = Standing(self.counters, self._close_gate, has_hook=has_hook)
         self._claims = threading.Lock()
         self._restart_at_ns = 0
+        self._freed_ns = clock.NEVER
         self._backoff_ns = FIRST_BACKOFF_NS
         self.apply(core.spec)
 
@@ -419,10 +420,12 @@ class LiveNode:
     def owed_from_ns(self) -> int:
         """The instant before which no tick is owed, whatever waits [ns].
 
-        Messages wait while nothing runs, and while the node is to restart. How long it
-        waits for its predecessors is bounded and by design, however short a timeout.
+        Messages wait while nothing runs, and while the node is to restart or is held. How
+        long it waits for its predecessors is bounded and by design, however short a timeout.
         """
-        return max(self.timeline.epoch_ns, self._restart_at_ns, self.waited_until_ns)
+        return max(
+            self.timeline.epoch_ns, self._restart_at_ns, self.waited_until_ns, self._freed_ns
+        )
 
     def frozen_for(self, limit_ns: int) -> bool:
         """Return whether a tick, or `init()` in its place, has been running for longer.
@@ -471,6 +474,7 @@ class LiveNode:
 
         Thread: any.
         """
+        self._freed_ns = self.timeline.now_ns()
         self.standing.let_go()
         self.in_episode = False
         self.regate()

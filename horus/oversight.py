@@ -96,11 +96,10 @@ class Oversight:
 
     def critical_late(self, live: LiveNode, lasted_ns: int) -> None:
         """See to it that a critical node's late end has consequences; see `Control`."""
-        supervisor, simulation = self._supervisor, self._drivers.simulation
-        if simulation is not None:
-            simulation.critical_late(live, lasted_ns)
-        elif supervisor is not None:
-            supervisor.critical_late(live, lasted_ns)
+        times_cleared = self.safety.times_cleared
+        acting = self._drivers.simulation or self._supervisor
+        if acting is not None:
+            acting.critical_late(live, lasted_ns, times_cleared)
 
     def report(self, write: Callable[[], None]) -> None:
         """Log something, where that may take as long as it likes."""

@@ -64,13 +64,15 @@ class Inspector:
 
     def inspect(self) -> None:
         """Find what has run out by now, and act."""
+        times_cleared = self._safety.times_cleared
         for finding in self._watchdog.look(self._now_ns()):
-            self._act(finding)
+            self._act(finding, times_cleared)
 
-    def critical_late(self, live: LiveNode, lasted_ns: int) -> None:
+    def critical_late(self, live: LiveNode, lasted_ns: int, times_cleared: int) -> None:
         """Act on a critical node that was owed a tick for too long [ns] before anybody looked.
 
         Because the whole process stood still, say: the motor was not controlled either.
+        When that was seen, the safe state had been cleared so many times.
         """
         if live.critical_ns is None:
             return
@@ -79,10 +81,10 @@ class Inspector:
             f"critical node {live.name} was owed a tick for {readable(lasted_ns)}, longer than "
             f"its limit of {readable(live.critical_ns)}, before anybody could look"
         )
-        if self._safety.enter(reason, self._watchdog.watched):
+        if self._safety.enter(reason, self._watchdog.watched, times_cleared):
             self._report(functools.partial(_tell_of_entry, reason))
 
-    def _act(self, finding: Finding) -> None:
+    def _act(self, finding: Finding, times_cleared: int) -> None:
         live, health = finding.live, finding.health
         before = live.standing.health
         if finding.critical and health is Health.HEALTHY:
@@ -103,7 +105,7 @@ class Inspector:
                 f"critical node {live.name} {_lasting(finding)}, longer than its limit of "
                 + readable(live.critical_ns if finding.critical else 3 * self._timeout_ns(live))
             )
-            if self._safety.enter(reason, self._watchdog.watched):
+            if self._safety.enter(reason, self._watchdog.watched, times_cleared):
                 entered = reason
         if news or entered is not None:
             self._report(functools.partial(self._tell, finding, health, news, entered, stack))

@@ -35,20 +35,29 @@ class Safety:
         self._lock = threading.Lock()
         self.reason: str | None = None
         """Why the system-wide safe state was entered; None while it is not."""
+        self.times_cleared = 0
+        """What was seen before the last time has been dealt with."""
 
     @property
     def active(self) -> bool:
         """Whether the system is in its safe state."""
         return self.reason is not None
 
-    def enter(self, reason: str, lives: Callable[[], Iterable[LiveNode]]) -> bool:
+    def enter(
+        self, reason: str, lives: Callable[[], Iterable[LiveNode]], times_cleared: int
+    ) -> bool:
         """Enter the system-wide safe state; return False if it is in it already.
 
         The hook of every node is called, in shutdown order. Nodes without one
         tick on, so that they can report.
+
+        Args:
+            reason: Why.
+            lives: Returns the nodes.
+            times_cleared: As it was when the reason was seen.
         """
         with self._lock:
-            if self.reason is not None:
+            if self.active or times_cleared != self.times_cleared:
                 return False
             self.reason = reason
             # Asked for now: who begins to take part later finds the safe state active.
@@ -96,6 +105,7 @@ class Safety:
             # Again: one that froze meanwhile has found the safe state active.
             self._refuse_if_frozen(lives)
             news = self.active or any(live.standing.held for live in lives)
+            self.times_cleared += self.active
             self.reason = None
             for live in lives:
                 standing = live.standing

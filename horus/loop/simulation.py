@@ -231,9 +231,9 @@ class Simulation(Stepper):
         """Take note that nodes have come, or that a timeout has changed."""
         self._inspector.look_again()
 
-    def critical_late(self, live: LiveNode, lasted_ns: int) -> None:
+    def critical_late(self, live: LiveNode, lasted_ns: int, times_cleared: int) -> None:
         """Act on a critical node's tick that took too long [ns] and ended unseen."""
-        self._inspector.critical_late(live, lasted_ns)
+        self._inspector.critical_late(live, lasted_ns, times_cleared)
 
     def thread_id(self, live: LiveNode) -> int | None:
         """Return None: no tick keeps another from its thread."""

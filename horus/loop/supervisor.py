@@ -98,9 +98,10 @@ class Supervisor:
         """Take note that nodes have come, or that a timeout has changed."""
         self._thread.call(self._changed.set)
 
-    def critical_late(self, live: LiveNode, lasted_ns: int) -> None:
+    def critical_late(self, live: LiveNode, lasted_ns: int, times_cleared: int) -> None:
         """Act on a critical node's tick that took too long [ns] and ended before we could look."""
-        self._thread.call(functools.partial(self._inspector.critical_late, live, lasted_ns))
+        act = functools.partial(self._inspector.critical_late, live, lasted_ns, times_cleared)
+        self._thread.call(act)
 
     def report(self, write: Callable[[], None]) -> None:
         """Log something soon; return at once."""

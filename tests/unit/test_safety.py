@@ -46,8 +46,8 @@ def test_all_are_held_before_the_first_hook_is_called() -> None:
         make_live("c", 2, order=5),
         make_live("reporter", 3, hook=False),
     ]
-    assert safety.enter("because", lambda: lives)
-    assert not safety.enter("again", lambda: lives)
+    assert safety.enter("because", lambda: lives, safety.times_cleared)
+    assert not safety.enter("again", lambda: lives, safety.times_cleared)
 
     assert hooks.called == ["c", "a", "b"]
     assert [live.standing.held for live in lives] == [True, True, True, False]
@@ -66,7 +66,7 @@ def test_a_node_that_comes_at_that_moment_is_held() -> None:
         assert safety.active
         return [before]
 
-    safety.enter("because", members)
+    safety.enter("because", members, safety.times_cleared)
     safety.join(late)
 
     assert before.standing.held
@@ -87,3 +87,28 @@ def test_a_tick_that_has_ended_is_not_isolated() -> None:
     assert safety.isolate(live, 5)
     assert live.standing.held
     assert hooks.called == ["a"]
+
+
+def test_what_was_seen_before_the_safe_state_was_cleared_does_not_enter_it_again() -> None:
+    """Clearing may come between a look and what follows from it: that has been dealt with."""
+    hooks = Hooks()
+    safety = Safety(hooks)
+    live = make_live("motor", 0)
+    seen = safety.times_cleared
+    assert safety.enter("because", lambda: [live], seen)
+    assert safety.clear([live]) == []
+
+    assert not safety.enter("because", lambda: [live], seen)
+    assert safety.enter("again", lambda: [live], safety.times_cleared)
+    assert hooks.called == ["motor", "motor"]
+
+
+def test_a_node_that_was_held_is_owed_nothing_from_before() -> None:
+    """Its releases went by on purpose."""
+    safety = Safety(Hooks())
+    live = make_live("motor", 0)
+    safety.enter("because", lambda: [live], safety.times_cleared)
+    before = live.timeline.now_ns()
+    safety.clear([live])
+
+    assert live.owed_from_ns >= before
