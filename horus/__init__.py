@@ -18,6 +18,8 @@ from horus.errors import (
     TopicError,
     UnavailableWarning,
     UnknownNodeError,
+    WorkerDied,
+    WorkerError,
 )
 from horus.node import Node
 from horus.ports import Pub, Sub
@@ -55,6 +57,8 @@ __all__ = [
     "TopicError",
     "UnavailableWarning",
     "UnknownNodeError",
+    "WorkerDied",
+    "WorkerError",
     "__version__",
     "budget_remaining",
     "dt",

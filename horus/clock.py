@@ -14,7 +14,7 @@ import time
 import weakref
 from collections.abc import Callable
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from horus.stats import NodeCounters
 from horus.timing import ReleaseGrid
@@ -77,6 +77,28 @@ class SimClock:
         self._instant_ns = max(self._instant_ns, instant_ns)
 
 
+class Position(NamedTuple):
+    """Where a timeline stands."""
+
+    epoch_ns: int
+    first_cycle: int
+    paused_at: int | None
+    started_ns: int | None
+
+
+class Moment(NamedTuple):
+    """What the clock functions of a callback depend on: it goes to a worker process with a call."""
+
+    position: Position
+    ticking: bool
+    release_ns: int
+    start_ns: int
+    previous_ns: int
+    budget_ns: int | None
+    nominal_dt_s: float
+    ticks: int
+
+
 class Timeline:
     """One scheduler's time: its clock, its epoch and its cycle count.
 
@@ -84,15 +106,32 @@ class Timeline:
     starts, so that a scheduler can run again; the cycle count goes on.
     """
 
-    def __init__(self, clock: Clock, tick_rate_hz: float, *, seed: int | None = None) -> None:
-        """Begin at the current instant; a `seed` makes the timeline deterministic."""
+    def __init__(
+        self,
+        clock: Clock,
+        tick_rate_hz: float,
+        *,
+        seed: int | None = None,
+        wall_offset_ns: int | None = None,
+    ) -> None:
+        """Begin at the current instant.
+
+        Args:
+            clock: Tells the time.
+            tick_rate_hz: Cycles per second [Hz].
+            seed: Makes the timeline deterministic.
+            wall_offset_ns: Of a timeline that this one is to agree with [ns].
+        """
         self.clock = clock
         self.now_ns = clock.now_ns
         self.seed = seed
         self.tick_rate_hz = tick_rate_hz
         self._first_cycle = 0
         self._paused_at: int | None = 0
-        self._wall_offset_ns = 0 if self.deterministic else wall_ns() - monotonic_ns()
+        if wall_offset_ns is None:
+            wall_offset_ns = 0 if self.deterministic else wall_ns() - monotonic_ns()
+        self.wall_offset_ns = wall_offset_ns
+        """Wall time less the clock's [ns]."""
         self.started_ns: int | None = None
         self.end_ns = FOREVER_NS
         """The end of a run of limited time [ns]: no release at or after it."""
@@ -107,6 +146,16 @@ class Timeline:
     def epoch_ns(self) -> int:
         """The instant of release 0 [ns]."""
         return self.grid.epoch_ns
+
+    def position(self) -> Position:
+        """Return where it stands, for `follow` in another process."""
+        return Position(self.grid.epoch_ns, self._first_cycle, self._paused_at, self.started_ns)
+
+    def follow(self, position: Position) -> None:
+        """Stand where another timeline with the same clock does."""
+        if position != self.position():
+            epoch_ns, self._first_cycle, self._paused_at, self.started_ns = position
+            self.grid = ReleaseGrid(epoch_ns, self.tick_rate_hz)
 
     def begin(self, epoch_ns: int, duration_ns: int | None = None) -> None:
         """Start the grid at `epoch_ns`; the cycle count goes on."""
@@ -146,7 +195,7 @@ class Timeline:
 
     def wall_s(self) -> float:
         """Return wall time [s]: fixed at construction plus monotonic progress."""
-        return (self.now_ns() + self._wall_offset_ns) / NS_PER_S
+        return (self.now_ns() + self.wall_offset_ns) / NS_PER_S
 
     def elapsed_s(self) -> float:
         """Return the time since the scheduler first started [s]."""
@@ -188,6 +237,30 @@ class TickContext:
         self.finish_ns = NEVER
         self.ticking = False
         self.random: tuple[int, random.Random] | None = None
+
+    def moment(self) -> Moment:
+        """Return what another context has to `follow` to answer as this one does."""
+        return Moment(
+            self.timeline.position(),
+            self.ticking,
+            self.release_ns,
+            self.start_ns,
+            self.previous_ns,
+            self.budget_ns,
+            self.nominal_dt_s,
+            self.counters.ticks,
+        )
+
+    def follow(self, moment: Moment) -> None:
+        """Answer as the context does that this moment is from."""
+        self.timeline.follow(moment.position)
+        self.ticking = moment.ticking
+        self.release_ns = moment.release_ns
+        self.start_ns = moment.start_ns
+        self.previous_ns = moment.previous_ns
+        self.budget_ns = moment.budget_ns
+        self.nominal_dt_s = moment.nominal_dt_s
+        self.counters.ticks = moment.ticks
 
     def dt_s(self) -> float:
         """Return the time since the previous tick [s]; nominal on the first."""

@@ -37,6 +37,7 @@ class NodeCore:
         self.pubs = pubs
         self.subs = subs
         self.is_async = is_async_callable(functions["tick"])
+        self.functions = functions
         self.on_error: Callable[[Any, BaseException], None] | None = functions["on_error"]
         self.callbacks = {
             phase: _without_arguments(functions[phase], node)
@@ -48,6 +49,13 @@ class NodeCore:
         self.outputs: dict[Any, Publisher] = {}
         self.inputs: dict[Any, Subscription] = {}
         self._bus: Bus | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what goes to a worker process: no scheduler, no open ports, nobody to tell."""
+        state = self.__dict__.copy()
+        state.update(owner=None, request_stop=None, outputs={}, inputs={}, _bus=None)
+        state.update(on_error=None, functions={})
+        return state
 
     @property
     def dropped(self) -> int:
@@ -87,24 +95,26 @@ class NodeCore:
         self.inputs.clear()
         self.outputs.clear()
 
-    def open_output(self, topic: str | type) -> Publisher:
+    def open_output(self, topic: str | type, *, warn: bool = True) -> Publisher:
         """Open a topic for sending that was not declared, or under another key."""
         found = self._connected_bus().topic(topic)
         publisher = self.outputs.get(found.name)
         if publisher is None:
             publisher = self.outputs[found.name] = found.publisher(self.spec.name)
-            self._warn_undeclared("sends to", "pubs", found.name)
+            if warn:
+                self._warn_undeclared("sends to", "pubs", found.name)
         self.outputs[topic] = publisher
         return publisher
 
-    def open_input(self, topic: str | type) -> Subscription:
+    def open_input(self, topic: str | type, *, warn: bool = True) -> Subscription:
         """Open a topic for receiving that was not declared, or under another key."""
         bus = self._connected_bus()
         found = bus.topic(topic)
         subscription = self.inputs.get(found.name)
         if subscription is None:
             subscription = self.inputs[found.name] = bus.subscribe(found.name, self.spec.name)
-            self._warn_undeclared("receives from", "subs", found.name)
+            if warn:
+                self._warn_undeclared("receives from", "subs", found.name)
         self.inputs[topic] = subscription
         return subscription
 

@@ -6,6 +6,7 @@ built here so that one mistake reads the same wherever it is made.
 
 from __future__ import annotations
 
+import signal
 import sys
 import warnings
 from typing import Any
@@ -86,6 +87,31 @@ class ShutdownTimeout(HorusError):
         super().__init__(f"node {node!r} did not shut down within {timeout_s:g} s")
         self.node = node
         self.timeout_s = timeout_s
+
+
+class WorkerError(HorusError):
+    """A node's worker process cannot be had, or something cannot travel there or back."""
+
+
+class WorkerDied(WorkerError):
+    """A node's worker process has ended by itself, or was killed."""
+
+    def __init__(self, node: str, status: int) -> None:
+        """Tell how: the exit status, or the negative number of a signal."""
+        if status < 0:
+            try:
+                how = f"was killed by {signal.Signals(-status).name}"
+            except ValueError:
+                how = f"was killed by signal {-status}"
+        else:
+            how = f"has exited with status {status}"
+        super().__init__(f"the worker process of node {node!r} {how}")
+        self.node = node
+        self.status = status
+
+    def __reduce__(self) -> tuple[type[WorkerDied], tuple[str, int]]:
+        """Pickle by what it was made from."""
+        return WorkerDied, (self.node, self.status)
 
 
 class HorusWarning(UserWarning):

@@ -23,6 +23,8 @@ class Outcome:
     """Response time beyond the deadline [ns]."""
     failed: bool = False
     """Whether the callback raised."""
+    died: bool = False
+    """Whether the node's worker process has ended, and with it what `init()` had made."""
 
     @property
     def missed(self) -> bool:
@@ -66,7 +68,8 @@ def decide(
         skip_next=missed and on_miss is Miss.SKIP,
         enter_safe_state=missed and on_miss is Miss.SAFE_MODE and not in_episode,
         stop=missed and on_miss is Miss.STOP,
-        restart=outcome.failed and failure_policy is FailurePolicy.RESTART,
+        restart=(outcome.failed and failure_policy is FailurePolicy.RESTART)
+        or (outcome.died and failure_policy is not FailurePolicy.FATAL),
         fatal=outcome.failed and failure_policy is FailurePolicy.FATAL,
     )
 

@@ -237,6 +237,21 @@ class Node:
         """Log at error level; see `log_debug`."""
         self._horus_emit(logging.ERROR, message, args)
 
+    def __getstate__(self) -> object:
+        """Return what goes to a worker process: all but the open ports."""
+        state = object.__getstate__(self)
+        if isinstance(state, dict):
+            return {
+                key: state[key] for key in state if key not in ("_horus_outputs", "_horus_inputs")
+            }
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over what `__getstate__` has returned."""
+        self.__dict__.update(state)
+        self._horus_outputs = self._horus_core.outputs
+        self._horus_inputs = self._horus_core.inputs
+
     def __repr__(self) -> str:
         """Show what the node is and how it is scheduled."""
         spec = self._horus_core.spec

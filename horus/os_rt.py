@@ -12,12 +12,14 @@ from __future__ import annotations
 import ctypes
 import functools
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
 
 _TFD_TIMER_ABSTIME = 1
+_PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
 _PR_GET_TIMERSLACK = 30
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
@@ -135,6 +137,28 @@ def demote(thread: int) -> None:
     if not hasattr(os, "sched_setscheduler"):
         raise OSError("per-thread priorities are not available on this platform")
     os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+
+
+def run_behind(niceness: int) -> None:
+    """Let the calling process run behind others: 1 to 19, the higher the more.
+
+    Raises:
+        OSError: Not on this platform.
+    """
+    if not hasattr(os, "setpriority"):
+        raise OSError("priorities are not available on this platform")
+    os.setpriority(os.PRIO_PROCESS, 0, niceness)
+
+
+def die_with_parent() -> None:
+    """Have the kernel kill this process when the thread that started it ends, or its process.
+
+    Does nothing where the kernel cannot. Source: prctl(2), PR_SET_PDEATHSIG.
+    """
+    try:
+        _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    except OSError:
+        pass
 
 
 def affinity() -> set[int]:

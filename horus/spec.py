@@ -124,6 +124,8 @@ class NodeSpec:
     on_miss: Miss
     failure_policy: FailurePolicy | None
     execution_class: ExecutionClass
+    process: bool
+    """Whether a compute node has a process of its own."""
     on: str | None
     priority: int | None
     core: int | None
@@ -166,7 +168,7 @@ def make_node_spec(
         TopicError: `on` is not a usable topic name.
     """
     checked_name = check_name("name", name)
-    compute_kind = check_compute(compute)
+    compute_kind, process = check_compute(compute)
     _refuse_combinations(compute_kind, on=on, is_async=is_async, rate=rate)
     if not is_int(order) or order < 0:
         raise ConfigError("order", order, "must be a whole number >= 0; lower runs earlier")
@@ -190,6 +192,7 @@ def make_node_spec(
             timed=any(limit is not None for limit in (rate, budget, deadline)),
         ),
         on=None if on is None else check_topic(on),
+        process=process,
         priority=check_priority(priority),
         core=None if core is None else check_core("core", core),
         watchdog_ns=optional_duration("watchdog", watchdog),

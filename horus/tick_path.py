@@ -22,7 +22,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from horus.clock import NEVER
-from horus.errors import NodeError
+from horus.errors import NodeError, WorkerDied
 from horus.escalation import Action, Outcome, decide
 from horus.live import Admission, Limits, LiveNode, being_cancelled, never_awaited
 from horus.spec import Health
@@ -166,7 +166,12 @@ def _settle(
     context.finish_ns = finish_ns
     counters = live.counters
     past_deadline_ns = finish_ns - release_ns - limits.deadline_ns
-    outcome = Outcome(max(0, over_budget_ns), max(0, past_deadline_ns), error is not None)
+    outcome = Outcome(
+        max(0, over_budget_ns),
+        max(0, past_deadline_ns),
+        failed=error is not None,
+        died=isinstance(error, WorkerDied),
+    )
     action = decide(
         outcome,
         on_miss=live.spec.on_miss,
@@ -189,6 +194,20 @@ def _settle(
     if standing.health is not Health.HEALTHY:
         _tell_that_it_ended(live)
     return enter_safe_state
+
+
+def worker_died(live: LiveNode, error: WorkerDied) -> None:
+    """Do what a failed tick would lead to: the node's worker process has ended between two.
+
+    Thread: the node's.
+    """
+    if live.retired or live.abandoned or not live.initialized:
+        return  # it was to end
+    live.tick_failed(error)
+    outcome = Outcome(failed=True, died=True)
+    policies = (live.spec.on_miss, live.spec.failure_policy)
+    action = decide(outcome, on_miss=policies[0], failure_policy=policies[1], in_episode=False)
+    _act(live, live.limits, outcome, action, error)
 
 
 def _tell_that_it_ended(live: LiveNode) -> None:

@@ -58,6 +58,7 @@ class Subscription:
         "_already_sent",
         "_overflowing",
         "_sent_until",
+        "away",
         "capacity",
         "owner",
         "queue",
@@ -73,6 +74,8 @@ class Subscription:
         self.capacity = capacity
         self.queue: deque[Frozen] = deque(maxlen=capacity)
         self.received = 0
+        self.away = 0
+        """How many messages wait in the reader's worker process."""
         self.wake: Callable[[], None] | None = None
         self._already_sent = topic.sent
         self._sent_until: int | None = None
@@ -85,7 +88,7 @@ class Subscription:
         # shared between threads loses counts.
         sent = self.topic.sent if self._sent_until is None else self._sent_until
         arrived = sent - self._already_sent
-        return max(0, arrived - self.received - len(self.queue))
+        return max(0, arrived - self.received - self.away - len(self.queue))
 
     def take(self) -> Any:
         """Return the oldest message, or None."""
@@ -96,6 +99,14 @@ class Subscription:
             return None
         self.received += 1
         return payload if thaw is None else thaw(payload)
+
+    def hand_over(self) -> list[Frozen]:
+        """Take all that waits, frozen as it is, for a reader in another process."""
+        handed = [self.queue.popleft() for _ in range(len(self.queue))]
+        self.away += len(handed)
+        if not handed:
+            self._overflowing = False
+        return handed
 
     def take_all(self) -> list[Any]:
         """Return every waiting message, oldest first."""
@@ -274,9 +285,13 @@ class Topic:
     def publisher(self, owner: str) -> Publisher:
         """Return a new sender's end."""
         with self._lock:
-            publisher = Publisher(self, owner)
+            publisher = self.make_publisher(owner)
             self.publishers = (*self.publishers, publisher)
             return publisher
+
+    def make_publisher(self, owner: str) -> Publisher:
+        """Return a sender's end that counts for nothing yet."""
+        return Publisher(self, owner)
 
     def retire(self, publisher: Publisher) -> None:
         """Take a sender's end away; unknown ones are ignored."""
@@ -331,9 +346,13 @@ class Bus:
         with self._lock:
             topic = self._topics.get(checked)
             if topic is None:
-                topic = self._topics[checked] = Topic(checked, self._lock)
+                topic = self._topics[checked] = self.make_topic(checked)
                 topic.taps = self._taps
             return topic
+
+    def make_topic(self, name: str) -> Topic:
+        """Return a new topic."""
+        return Topic(name, self._lock)
 
     def subscribe(self, name: Any, owner: str, capacity: int = DEFAULT_CAPACITY) -> Subscription:
         """Return a new subscription to a topic."""

@@ -114,20 +114,26 @@ def check_priority(value: object) -> int | None:
     return int(value)
 
 
-def check_compute(value: object) -> bool:
-    """Return whether a node is a compute node; refuse kinds that do not exist."""
+def check_compute(value: object) -> tuple[bool, bool]:
+    """Return whether a node is a compute node, and whether it has a process of its own.
+
+    Raises:
+        ConfigError: There is no such kind, or no worker processes on this platform.
+    """
     if value == "process":
-        raise ConfigError(
-            "compute",
-            value,
-            "worker processes are not part of this version; "
-            "compute=True runs the node on a thread of its own",
-        )
+        if os.name != "posix":
+            raise ConfigError(
+                "compute",
+                value,
+                "there are no worker processes on this platform; "
+                "compute=True runs the node on a thread of its own",
+            )
+        return True, True
     if value == "thread":
-        return True
+        return True, False
     if not isinstance(value, bool):
-        raise ConfigError("compute", value, "must be True, False or 'thread'")
-    return value
+        raise ConfigError("compute", value, "must be True, False, 'thread' or 'process'")
+    return value, False
 
 
 def member(kind: type[E], argument: str, value: object) -> E:

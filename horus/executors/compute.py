@@ -7,13 +7,17 @@ other, and a node finds itself on the same thread at every tick.
 from __future__ import annotations
 
 import functools
+import threading
 
 from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
 from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
 from horus.loop.realtime import RealTime
+from horus.loop.safety import HOOK_TIMEOUT_S
+from horus.loop.stacks import Stack
 from horus.tick_path import build_tick
+from horus.workers.process import RemoteNode
 
 
 class ComputeThread(NodeThread):
@@ -34,6 +38,24 @@ class ComputeThread(NodeThread):
             self.posted_ns = None
 
 
+class WorkerThread(ComputeThread):
+    """Has ticks run in a worker process, and waits for them with the interpreter free."""
+
+    def __init__(self, live: LiveNode, real_time: RealTime) -> None:
+        """Prepare; the process comes with `init()`."""
+        self.remote = RemoteNode(live, real_time, self.post)
+        live.callbacks = self.remote.callbacks()
+        super().__init__(live, real_time)
+
+    def kill(self) -> None:
+        """Kill the process once the safe-state hook has returned, or had its time.
+
+        Thread: any.
+        """
+        self.live.standing.hook_returned.wait(HOOK_TIMEOUT_S)
+        self.remote.kill()
+
+
 class ComputeExecutor(ThreadExecutor[ComputeThread]):
     """Hands each release to the node's worker; one that finds it busy is skipped."""
 
@@ -46,7 +68,31 @@ class ComputeExecutor(ThreadExecutor[ComputeThread]):
 
     def make_thread(self, live: LiveNode) -> ComputeThread:
         """Return the node's thread, not started."""
-        return ComputeThread(live, self._real_time)
+        kind = WorkerThread if live.spec.process else ComputeThread
+        return kind(live, self._real_time)
+
+    def isolate(self, live: LiveNode) -> None:
+        """Kill a worker process that is frozen; on a thread nothing can be cut short."""
+        thread = self.find_thread(live)
+        if isinstance(thread, WorkerThread):
+            threading.Thread(
+                target=thread.kill, name=f"horus-kill:{live.name}", daemon=True
+            ).start()
+
+    def stack(self, live: LiveNode) -> Stack:
+        """Return where the node's callbacks are, in whatever process."""
+        thread = self.find_thread(live)
+        if isinstance(thread, WorkerThread) and live.busy and (stack := thread.remote.stack()):
+            return stack
+        return super().stack(live)
+
+    def dismiss(self, live: LiveNode) -> None:
+        """End the node's thread, and its process."""
+        thread = self.find_thread(live)
+        super().dismiss(live)
+        if isinstance(thread, WorkerThread):
+            thread.remote.kill()
+            live.callbacks = live.core.callbacks
 
     def engage(self, live: LiveNode, from_ns: int) -> None:
         """Release the node on its grid."""

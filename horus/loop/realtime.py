@@ -119,6 +119,18 @@ class RealTime:
             with contextlib.suppress(OSError):
                 os_rt.run_first()
 
+    def cores_of_worker(self, live: LiveNode) -> tuple[int, ...] | None:
+        """Return where a node's worker process runs; None for anywhere.
+
+        Under `rt=True` away from the core that the Rt nodes share, if there is another.
+        """
+        if live.spec.core is not None:
+            return (live.spec.core,)
+        allowed = os_rt.affinity() if self._cores is None else set(self._cores)
+        if self._rt:
+            allowed = allowed - set(self._cores_of(live) or ()) or allowed
+        return tuple(sorted(allowed)) or None
+
     def enter_supervisor_thread(self) -> None:
         """Put supervision, and the threads that it starts, above every node."""
         if self._rt:

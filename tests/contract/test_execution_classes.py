@@ -93,10 +93,11 @@ def test_contradicting_configurations_are_errors_that_say_why(configuration, wor
     assert all(word in str(refused.value) for word in words)
 
 
-def test_compute_in_a_process_is_refused_until_it_exists():
-    """compute="process" raises plainly instead of running somewhere else."""
-    with pytest.raises(ConfigError, match=r"compute='process'.*compute=True"):
-        Node("node", nothing, compute="process")
+@pytest.mark.parametrize("value", ["fork", "", 1, None])
+def test_other_kinds_of_compute_are_refused(value):
+    """A kind that does not exist raises plainly instead of running somewhere else."""
+    with pytest.raises(ConfigError, match=r"compute=.*must be True, False, 'thread' or 'process'"):
+        Node("node", nothing, compute=value)
 
 
 @pytest.mark.parametrize("phase", ["init", "shutdown", "safe_state"])

@@ -1,0 +1,1 @@
+"""Worker processes: a compute node off the interpreter of its scheduler."""

@@ -1,0 +1,100 @@
+"""What a scheduler and a worker say to each other.
+
+The scheduler sends a `Place` and a `Setup` first, and then `Call`s, one at a time. The
+worker answers each with a `Done`; in between come, in their order, whatever the callback does:
+a message it `Sent`, a line it `Logged`, a stop it asks for, a question.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from horus.clock import Moment
+from horus.snapshot import Frozen
+
+Inputs = Sequence[tuple[str, Sequence[Frozen]]]
+"""What has arrived since the last call: topics with their messages, oldest first."""
+
+
+@dataclass(slots=True)
+class Place:
+    """Where a worker lives: what it needs to understand the rest."""
+
+    parent: int
+    """The scheduler's process."""
+    path: Sequence[str]
+    """Its `sys.path`."""
+    cores: Sequence[int] | None
+    """Where to run; None for anywhere."""
+
+
+@dataclass(slots=True)
+class Setup:
+    """What a worker is to run."""
+
+    levels: Mapping[str, int]
+    """From which level on loggers are listened to."""
+    timeline: tuple[float, int]
+    """Its tick rate [Hz], and the offset of its wall time [ns]."""
+    parcel: bytes
+    """The node; see `pickling.pack`."""
+    types: Mapping[str, type]
+    """The types that topics have been declared with."""
+    newest: Inputs
+    """The newest message of each topic that the node receives."""
+
+
+@dataclass(slots=True)
+class Call:
+    """Run a callback."""
+
+    phase: str
+    moment: Moment
+    inputs: Inputs = ()
+
+
+@dataclass(slots=True)
+class Done:
+    """The callback has returned, or raised `error` (see `pickling.pack_error`)."""
+
+    error: bytes | None
+    queues: Sequence[tuple[str, int, int]]
+    """Topics with how many messages were received of them in all, and how many wait."""
+
+
+@dataclass(slots=True)
+class Sent:
+    """The callback has sent a message, isolated already."""
+
+    topic: str
+    message: Frozen
+
+
+@dataclass(slots=True)
+class Logged:
+    """The callback has logged something; the fields of its record."""
+
+    record: Mapping[str, Any]
+
+
+@dataclass(slots=True)
+class Stop:
+    """The callback asks for an ordered stop."""
+
+    reason: str
+
+
+@dataclass(slots=True)
+class Open:
+    """The callback receives from a topic it did not declare; answered with its newest message."""
+
+    topic: str
+
+
+@dataclass(slots=True)
+class Fetch:
+    """The worker does not know something of `__main__`; answered with it, by value."""
+
+    name: str

@@ -1,0 +1,397 @@
+"""The scheduler's side of a worker process: starts it, has it run callbacks, sees it end."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+from horus import clock
+from horus.errors import WorkerDied, WorkerError
+from horus.live import LiveNode
+from horus.loop.realtime import RealTime
+from horus.tick_path import worker_died
+from horus.topics import Subscription
+from horus.workers import messages
+from horus.workers.channel import Channel
+from horus.workers.pickling import by_value, dumps, loads, pack, part, unpack_error
+
+_CODE = (
+    "import sys; sys.path.insert(0, sys.argv[1]); "
+    "from horus.workers.worker import main; main(*map(int, sys.argv[2:]))"
+)
+_ROOT = Path(__file__).resolve().parents[2]
+_LAST_STEPS_S = 1.0
+"""How long a worker may take to end by itself [s]."""
+
+_STACK_TIMEOUT_S = 0.01
+_FRAME = re.compile(r'  File "(.*)", line (\d+) in (.*)')
+
+
+class WorkerProcess:
+    """One process, with what it says and what it is told.
+
+    Thread: any.
+    """
+
+    def __init__(self, name: str, on_end: Callable[[WorkerProcess], None]) -> None:
+        """Start it.
+
+        Args:
+            name: The node's.
+            on_end: Called with it when it has ended, on a thread of its own.
+
+        Raises:
+            WorkerError: It cannot be started.
+        """
+        self._name = name
+        self._on_end = on_end
+        self._over = threading.Event()
+        self._status = 0
+        self._stacks = os.memfd_create("horus-stacks") if hasattr(os, "memfd_create") else -1
+        turns, their_turns = socket.socketpair()
+        aside, their_aside = socket.socketpair()
+        self.turns = Channel(turns, dumps, loads)
+        self.aside = Channel(aside, dumps, loads)
+        started: Future[subprocess.Popen[bytes]] = Future()
+        # The kernel kills the worker when the thread that has started it ends: it stays.
+        keeper = threading.Thread(
+            target=self._keep,
+            args=(started, their_turns, their_aside),
+            name=f"horus-worker:{name}",
+            daemon=True,
+        )
+        try:
+            keeper.start()
+            self._process = started.result()
+        except Exception as exc:
+            self.close()
+            raise WorkerError(f"node {name!r}: no worker process can be had: {exc}") from exc
+
+    def death(self) -> WorkerDied:
+        """Return how it has ended; one that only does not answer any more is killed first."""
+        if not self._over.wait(_LAST_STEPS_S):
+            self.kill()
+            self._over.wait(_LAST_STEPS_S)
+        return WorkerDied(self._name, self._status)
+
+    def kill(self) -> None:
+        """End it at once."""
+        self._process.kill()
+
+    def end(self) -> None:
+        """Let it end by itself, for a while, and give everything back."""
+        self.close()
+        if not self._over.wait(_LAST_STEPS_S):
+            self.kill()
+            self._over.wait(_LAST_STEPS_S)
+
+    def close(self) -> None:
+        """Hang up."""
+        self.turns.close()
+        self.aside.close()
+        if self._stacks >= 0:
+            os.close(self._stacks)
+            self._stacks = -1
+
+    def stack(self) -> traceback.StackSummary | None:
+        """Return where its main thread is; None if it does not say in 10 ms.
+
+        Written by `faulthandler` in a signal handler: also of an extension that holds
+        the interpreter.
+        """
+        file = self._stacks
+        if file < 0:
+            return None
+        # The two share a file offset.
+        os.ftruncate(file, 0)
+        os.lseek(file, 0, os.SEEK_SET)
+        with contextlib.suppress(OSError):
+            self._process.send_signal(signal.SIGUSR1)
+        give_up_ns = clock.monotonic_ns() + round(_STACK_TIMEOUT_S * 1e9)
+        text = size = 0
+        while clock.monotonic_ns() < give_up_ns:
+            text, size = size, os.fstat(file).st_size
+            if size and size == text:
+                break
+            self._over.wait(0.001)
+        lines = os.pread(file, size, 0).decode(errors="replace").splitlines()
+        frames = [found.groups() for line in lines if (found := _FRAME.match(line))]
+        return traceback.StackSummary.from_list(
+            [traceback.FrameSummary(path, int(line), name) for path, line, name in reversed(frames)]
+        )
+
+    def _keep(self, started: Future[subprocess.Popen[bytes]], *theirs: socket.socket) -> None:
+        descriptors = [each.fileno() for each in theirs]
+        given = [*descriptors, self._stacks] if self._stacks >= 0 else descriptors
+        try:
+            process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-c",
+                    _CODE,
+                    str(_ROOT),
+                    *map(str, descriptors),
+                    str(self._stacks),
+                ],
+                stdin=subprocess.DEVNULL,
+                pass_fds=given,
+                start_new_session=True,  # Ctrl+C is for the scheduler, which ends it in order
+            )
+        except BaseException as exc:
+            started.set_exception(exc)
+            return
+        finally:
+            for each in theirs:
+                each.close()
+        started.set_result(process)
+        self._status = process.wait()
+        self._over.set()
+        self._on_end(self)
+
+
+class RemoteNode:
+    """A node whose callbacks run in a worker process, from `init` to `shutdown`.
+
+    Thread: the node's, unless a method says otherwise.
+    """
+
+    def __init__(
+        self,
+        live: LiveNode,
+        real_time: RealTime,
+        post: Callable[[Callable[[], None]], None],
+    ) -> None:
+        """Prepare.
+
+        Args:
+            live: The node.
+            real_time: Tells where the worker runs.
+            post: Runs a job on the node's thread, after what is in progress.
+        """
+        self._live = live
+        self._real_time = real_time
+        self._post = post
+        self._process: WorkerProcess | None = None
+        self._turn = threading.Lock()
+        self._aside = threading.Lock()
+        self._received_before: dict[str, int] = {}
+
+    def callbacks(self) -> dict[str, Callable[[], Any] | None]:
+        """Return what runs the node's callbacks in the worker."""
+        remote: dict[str, Callable[[], Any] | None] = {
+            "init": self._init,
+            "tick": self._tick,
+            "shutdown": self._shutdown,
+            "safe_state": None,
+        }
+        if self._live.core.callbacks["safe_state"] is not None:
+            remote["safe_state"] = functools.partial(self._run, "safe_state")
+        return remote
+
+    def kill(self) -> None:
+        """End the worker at once. Thread: any."""
+        process = self._process
+        if process is not None:
+            process.kill()
+
+    def end(self) -> None:
+        """End the worker, if there is one. Thread: any."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.end()
+        for subscription in self._subscriptions().values():
+            subscription.away = 0
+
+    def stack(self) -> traceback.StackSummary | None:
+        """Return where the worker's main thread is; None without a worker. Thread: any."""
+        process = self._process
+        return None if process is None else process.stack()
+
+    # -- callbacks ---------------------------------------------------------------------
+
+    def _init(self) -> None:
+        """Run the node's `init()`, in a new worker unless there is one: after a tick has failed."""
+        try:
+            if self._process is None:
+                self._start()
+            self._run("init")
+        except BaseException:
+            self.end()
+            raise
+
+    def _start(self) -> None:
+        live = self._live
+        place = messages.Place(os.getpid(), sys.path, self._real_time.cores_of_worker(live))
+        setup = self._setup(pack(live.core))
+        process = self._process = WorkerProcess(
+            live.name, lambda process: self._post(functools.partial(self._ended, process))
+        )
+        try:
+            process.turns.send(place)
+            process.turns.send(setup)
+        except OSError as exc:
+            raise process.death() from exc
+
+    def _ended(self, process: WorkerProcess) -> None:
+        """Act on the end of a worker, unless a callback has met it already."""
+        if self._process is process:
+            self.end()
+            worker_died(self._live, process.death())
+
+    def _tick(self) -> None:
+        try:
+            self._run("tick")
+        except WorkerDied:
+            self.end()
+            raise
+
+    def _shutdown(self) -> None:
+        """Run the node's `shutdown()`, unless its worker is gone, and end the worker."""
+        if self._process is not None:
+            try:
+                self._run("shutdown")
+            finally:
+                self.end()
+
+    def _run(self, phase: str) -> None:
+        """Run a callback in the worker.
+
+        In its turn; a hook or a shutdown aside, if a tick is in progress.
+
+        Raises:
+            WorkerDied: The worker has ended.
+            BaseException: What the callback has raised.
+
+        Thread: any.
+        """
+        process = self._process
+        if process is None:
+            raise WorkerError(f"node {self._live.name!r} has no worker process")
+        waits = phase in ("init", "tick")
+        if self._turn.acquire(blocking=waits):
+            with contextlib.ExitStack() as turn:
+                turn.callback(self._turn.release)
+                self._converse(process, process.turns, phase)
+        else:
+            with self._aside:
+                self._converse(process, process.aside, phase)
+
+    def _converse(self, process: WorkerProcess, channel: Channel, phase: str) -> None:
+        in_turn = channel is process.turns
+        call = messages.Call(phase, self._live.tick_context.moment())
+        if in_turn:
+            call.inputs = self._inputs()
+        try:
+            failed = self._send(call, channel)
+            while True:
+                try:
+                    said = channel.receive()
+                except (EOFError, OSError):
+                    raise
+                except Exception as exc:  # a message's own class
+                    failed = exc
+                    continue
+                if isinstance(said, messages.Done):
+                    break
+                self._hear(said, channel)
+        except (EOFError, OSError) as exc:
+            raise process.death() from exc
+        if in_turn:
+            self._count(said)
+        if said.error is not None:
+            raise unpack_error(said.error)
+        if failed is not None:
+            raise failed
+
+    def _send(self, call: messages.Call, channel: Channel) -> Exception | None:
+        """Ask for a callback; return what is wrong with messages that cannot travel."""
+        try:
+            channel.send(call)
+        except (EOFError, OSError):
+            raise
+        except Exception as exc:
+            kept, refused = part(call.inputs)
+            if not refused:
+                raise
+            for topic, _ in refused:
+                self._subscriptions()[topic].away -= 1
+            call.inputs = kept
+            channel.send(call)
+            topic, (payload, _) = refused[0]
+            return WorkerError(
+                f"topic {topic!r}: a {type(payload).__name__} cannot go to the worker process of "
+                f"node {self._live.name!r}: {exc}; send plain data, or keep the node on a "
+                "thread with compute=True"
+            )
+        return None
+
+    def _hear(self, said: Any, channel: Channel) -> None:
+        core = self._live.core
+        match said:
+            case messages.Sent(topic, message):
+                publisher = core.outputs.get(topic) or core.open_output(topic, warn=False)
+                publisher.deliver(message)
+            case messages.Logged(record):
+                logging.getLogger(record["name"]).handle(logging.makeLogRecord(dict(record)))
+            case messages.Stop(reason):
+                self._live.control.request_stop(reason)
+            case messages.Open(topic):
+                channel.send(core.open_input(topic, warn=False).topic.newest)
+            case messages.Fetch(name):
+                channel.send(by_value(name))
+
+    # -- topics --------------------------------------------------------------------------
+
+    def _setup(self, parcel: bytes) -> messages.Setup:
+        live = self._live
+        subscriptions = self._subscriptions()
+        self._received_before = {
+            topic: subscription.received for topic, subscription in subscriptions.items()
+        }
+        topics = [publisher.topic for publisher in live.core.outputs.values()]
+        topics += [subscription.topic for subscription in subscriptions.values()]
+        newest, refused = part(
+            [
+                (name, (subscription.topic.newest,))
+                for name, subscription in subscriptions.items()
+                if subscription.topic.newest is not None
+            ]
+        )
+        for topic, _ in refused:
+            live.emit(logging.WARNING, f"the message on topic {topic!r} cannot go to its process")
+        loggers = ("", "horus", f"horus.node.{live.name}")
+        return messages.Setup(
+            levels={name: logging.getLogger(name).getEffectiveLevel() for name in loggers},
+            timeline=(live.timeline.tick_rate_hz, live.timeline.wall_offset_ns),
+            parcel=parcel,
+            types={topic.name: topic.type for topic in topics if topic.type is not None},
+            newest=newest,
+        )
+
+    def _inputs(self) -> messages.Inputs:
+        waiting = self._subscriptions().items()
+        return [(topic, handed) for topic, each in waiting if (handed := each.hand_over())]
+
+    def _count(self, done: messages.Done) -> None:
+        subscriptions = self._subscriptions()
+        for topic, received, waiting in done.queues:
+            subscription = subscriptions[topic]
+            subscription.received = self._received_before.setdefault(topic, 0) + received
+            subscription.away = waiting
+
+    def _subscriptions(self) -> dict[str, Subscription]:
+        inputs = self._live.core.inputs.copy().items()
+        return {topic: subscription for topic, subscription in inputs if isinstance(topic, str)}

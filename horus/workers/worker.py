@@ -1,0 +1,245 @@
+"""The worker's side: runs one node's callbacks, as the scheduler asks for them.
+
+Started as `python -c ...` by `process.WorkerProcess`, with two sockets: one for the callbacks
+in their turn, and one for a safe-state hook or a shutdown that must not wait for a
+tick which does not end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import contextvars
+import inspect
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import cloudpickle
+
+from horus import clock, os_rt
+from horus.clock import MonotonicClock, TickContext, Timeline
+from horus.core import core_of
+from horus.errors import StateError, TopicError
+from horus.snapshot import Frozen
+from horus.stats import NodeCounters
+from horus.topics import Bus, Publisher, Subscription, Topic
+from horus.workers import messages
+from horus.workers.channel import Channel
+from horus.workers.pickling import Unpickler, dumps, pack_error
+
+_NICENESS = 5
+"""Behind the scheduler's own threads."""
+
+
+def main(turns: int, aside: int, stacks: int) -> None:
+    """Serve the scheduler at the other end of the sockets with these descriptors until it ends.
+
+    Args:
+        turns: For the callbacks in their turn.
+        aside: For what must not wait for them.
+        stacks: A file; at SIGUSR1 the stack of the main thread is written to it.
+    """
+    os_rt.die_with_parent()
+    if stacks >= 0:
+        import faulthandler
+
+        faulthandler.register(signal.SIGUSR1, file=stacks, all_threads=False)
+    with contextlib.suppress(EOFError, BrokenPipeError):
+        Worker(turns, aside).serve()
+
+
+class Worker:
+    """One node in a process of its own.
+
+    Thread: the main one, and one for what is asked aside.
+    """
+
+    def __init__(self, turns: int, aside: int) -> None:
+        """Wait for the setup, and take the node out of its parcel."""
+        self._conversation = threading.local()
+        self._turns = self._channel(turns)
+        self._aside = self._channel(aside)
+        self._conversation.channel = self._turns
+        self._settle(self._turns.receive())
+        setup: messages.Setup = self._turns.receive()
+        self._listen(setup.levels)
+        self._core = core_of(cloudpickle.loads(setup.parcel))
+        self._bus = _RemoteBus(self)
+        for topic, kind in setup.types.items():
+            self._bus.topic(topic).declare_type(kind)
+        self._core.connect(self._bus)
+        self._core.request_stop = lambda reason: self.say(messages.Stop(reason))
+        for topic, (newest,) in setup.newest:
+            self._bus.topic(topic).newest = newest
+        self._bus.declared = True
+        tick_rate_hz, wall_offset_ns = setup.timeline
+        timeline = Timeline(MonotonicClock(), tick_rate_hz, wall_offset_ns=wall_offset_ns)
+        self._tick_context = TickContext(self._core.spec.name, timeline, NodeCounters())
+        self._context = contextvars.copy_context()
+        self._context.run(clock.current.set, self._tick_context)
+        clock.set_ambient(timeline)
+
+    def _settle(self, place: messages.Place) -> None:
+        if os.getppid() != place.parent:
+            raise EOFError("the scheduler is gone")
+        sys.path[:] = place.path
+        with contextlib.suppress(OSError):
+            os_rt.run_behind(_NICENESS)
+            if place.cores is not None:
+                os_rt.run_on(place.cores)
+
+    def serve(self) -> None:
+        """Run callbacks until the scheduler hangs up."""
+        threading.Thread(target=self._serve_aside, name="horus-aside", daemon=True).start()
+        while True:
+            call: messages.Call = self._turns.receive()
+            self._deliver(call.inputs)
+            self._tick_context.follow(call.moment)
+            self.say(self._run(call.phase, self._context))
+
+    def _serve_aside(self) -> None:
+        self._conversation.channel = self._aside
+        with contextlib.suppress(EOFError, BrokenPipeError):
+            while True:
+                call: messages.Call = self._aside.receive()
+                # A copy: a tick that does not end still holds the node's own context.
+                self.say(self._run(call.phase, self._context.copy()))
+
+    def say(self, message: Any) -> None:
+        """Tell the scheduler something, in the conversation of the calling thread."""
+        getattr(self._conversation, "channel", self._turns).send(message)
+
+    def ask(self, question: Any) -> Any:
+        """Ask the scheduler something and wait for the answer.
+
+        Raises:
+            StateError: Not in a callback: nobody would answer.
+        """
+        channel: Channel | None = getattr(self._conversation, "channel", None)
+        if channel is None:
+            raise StateError("topics are opened in callbacks; declare them with subs= and pubs=")
+        channel.send(question)
+        return channel.receive()
+
+    def _channel(self, descriptor: int) -> Channel:
+        def loads(body: memoryview, buffers: Iterable[memoryview]) -> Any:
+            return Unpickler(body, buffers, self._fetch).load()
+
+        return Channel(socket.socket(fileno=descriptor), dumps, loads)
+
+    def _fetch(self, name: str) -> Any:
+        return cloudpickle.loads(self.ask(messages.Fetch(name)))
+
+    def _deliver(self, inputs: messages.Inputs) -> None:
+        for topic, arrived in inputs:
+            subscription = self._core.open_input(topic)
+            for frozen in arrived:
+                subscription.topic.newest = frozen
+                if len(subscription.queue) == subscription.capacity:
+                    subscription.note_overflow()
+                subscription.queue.append(frozen)
+
+    def _run(self, phase: str, context: contextvars.Context) -> messages.Done:
+        error: bytes | None = None
+        callback = self._core.callbacks[phase]
+        try:
+            result = None if callback is None else context.run(callback)
+            if inspect.iscoroutine(result):
+                result.close()
+                raise TypeError(f"{phase}() returned a coroutine that nobody would await")
+        except BaseException as exc:
+            exc.__traceback__ = _in_callback(exc)
+            error = pack_error(exc)
+        queues = [
+            (topic, subscription.received, len(subscription.queue))
+            for topic, subscription in self._core.inputs.items()
+            if isinstance(topic, str)
+        ]
+        return messages.Done(error, queues)
+
+    def _listen(self, levels: Mapping[str, int]) -> None:
+        logging.getLogger().addHandler(_Forwarder(self))
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
+
+
+class _RemoteBus(Bus):
+    """Topics whose subscriptions are filled by the scheduler, and whose publishers send there."""
+
+    def __init__(self, worker: Worker) -> None:
+        super().__init__()
+        self._worker = worker
+        self.declared = False
+        """Whether the ports that the node has declared are open."""
+
+    def subscribe(self, name: Any, owner: str, capacity: int = 0) -> Subscription:
+        subscription = super().subscribe(name, owner, *((capacity,) if capacity else ()))
+        if self.declared:
+            subscription.topic.newest = self._worker.ask(messages.Open(subscription.topic.name))
+        return subscription
+
+    def make_topic(self, name: str) -> Topic:
+        return _RemoteTopic(name, self._lock, self._worker)
+
+
+class _RemoteTopic(Topic):
+    """A topic of the scheduler's."""
+
+    def __init__(self, name: str, lock: threading.Lock, worker: Worker) -> None:
+        super().__init__(name, lock)
+        self._worker = worker
+
+    def make_publisher(self, owner: str) -> Publisher:
+        return _RemotePublisher(self, owner, self._worker)
+
+
+class _RemotePublisher(Publisher):
+    """Sends to the scheduler's topic."""
+
+    __slots__ = ("_worker",)
+
+    def __init__(self, topic: Topic, owner: str, worker: Worker) -> None:
+        super().__init__(topic, owner)
+        self._worker = worker
+
+    def deliver(self, frozen: Frozen) -> None:
+        try:
+            self._worker.say(messages.Sent(self.topic.name, frozen))
+        except (OSError, EOFError):
+            raise
+        except Exception as exc:
+            raise TopicError(
+                f"topic {self.topic.name!r}: {self.owner} sent a {type(frozen[0]).__name__}, "
+                f"which cannot leave its worker process: {exc}; send plain data, or keep the "
+                "node on a thread with compute=True"
+            ) from exc
+        self.sent += 1
+
+
+class _Forwarder(logging.Handler):
+    """Hands log records to the scheduler."""
+
+    def __init__(self, worker: Worker) -> None:
+        super().__init__()
+        self._worker = worker
+
+    def emit(self, record: logging.LogRecord) -> None:
+        fields = dict(record.__dict__)
+        fields.update(msg=record.getMessage(), args=None, exc_info=None)
+        if record.exc_info and not record.exc_text:
+            fields["exc_text"] = logging.Formatter().formatException(record.exc_info)
+        with contextlib.suppress(Exception):  # the scheduler is gone, or a field cannot travel
+            self._worker.say(messages.Logged(fields))
+
+
+def _in_callback(exc: BaseException) -> Any:
+    """Return the part of a traceback that is the callback's."""
+    place = exc.__traceback__
+    while place is not None and place.tb_frame.f_globals.get("__name__") == __name__:
+        place = place.tb_next
+    return place or exc.__traceback__
