@@ -75,7 +75,8 @@ class Node:
                 when a tick exceeds its deadline or its budget.
             failure_policy: `"fatal"`, `"restart"`, `"skip"` or `"ignore"`, when a
                 tick raises. None: log with traceback, count, keep ticking.
-            compute: True runs the node on a worker thread, for CPU-heavy work.
+            compute: True runs the node on a worker thread, for CPU-heavy work; "process"
+                in a worker process, where `init()`, ticks and `shutdown()` all run.
             on: Tick once per message of this topic, instead of at a rate.
             priority: SCHED_FIFO priority of the node's thread, 1 to 99; with `rt=True`
                 derived from the rate when not given.

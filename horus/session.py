@@ -78,6 +78,11 @@ class Session:
         """Whether nodes are being run."""
         return self.status == "running"
 
+    @property
+    def private_loop(self) -> asyncio.AbstractEventLoop | None:
+        """The event loop of runs on a thread of the scheduler's user; None while there is none."""
+        return None if self._loop is None else self._loop.loop
+
     def reporting_ns(self) -> int:
         """Return the instant up to which rates are reported [ns]; 0 when nothing runs."""
         return self.timeline.now_ns() if self.running else 0

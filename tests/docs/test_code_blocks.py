@@ -10,6 +10,8 @@ from pathlib import Path
 import doc_pages
 import pytest
 
+pytest_plugins = ["pytester"]
+
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 LANGUAGES = {"python", "text", "console", "toml"}
@@ -60,6 +62,15 @@ def test_code_blocks_run_and_print_what_the_page_shows(page: Path, tmp_path: Pat
         else:
             for sign in ("Traceback", "Warning: "):
                 assert sign not in result.logged, f"{where} logged\n\n{result.logged}"
+
+
+def test_the_tests_on_the_page_about_tests_pass(pytester: pytest.Pytester):
+    """Those that take fixtures are only defined when the page's code runs."""
+    page = (ROOT / "docs" / "how-to" / "test-a-node.md").read_text("utf-8")
+    pytester.makepyfile("\n\n".join(block.code for block in doc_pages.blocks(page)))
+    setting = "asyncio_default_fixture_loop_scope=function"
+    result = pytester.runpytest_subprocess("-p", "no:cacheprovider", "-o", setting)
+    assert result.parseoutcomes() == {"passed": 8}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)

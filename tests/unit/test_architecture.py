@@ -28,7 +28,7 @@ LAYERS = [
     ["session"],
     ["embedding"],
     ["scheduler"],
-    ["__init__"],
+    ["__init__", "testing"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
