@@ -19,8 +19,7 @@ from typing import Any
 from benchmarks import agv_report, cyclictest, harness, peers
 from benchmarks.agv_report import CYCLICTEST
 from benchmarks.agv_workloads.scenario import MARGIN_S, MODES, REACTIONS, SOAK, WARMUP_S
-from benchmarks.harness import ChildRun, Contender
-from benchmarks.micro import OURS
+from benchmarks.harness import OURS, ChildRun, Contender
 
 CHILDREN = Path(__file__).resolve().with_name("agv_workloads")
 WORKLOADS = (*MODES, *REACTIONS)
@@ -33,6 +32,7 @@ NOTES = (
     "tell the release. Early ones are negative. Counts are per 5 s.",
     "An order violation is a motor tick with no safety tick completed since the motor tick before; "
     "dora-rs offers no order, its nodes are processes, the planner in every mode.",
+    "Only this package moves a single node to a process of its own.",
 )
 
 OVER_ROUNDS = (
@@ -112,6 +112,15 @@ def our_contender(seconds: float) -> Contender:
     )
 
 
+def takes_part(label: str, mode: str) -> bool:
+    """Return whether a contender drives in this mode.
+
+    Where else than in a thread the planner can run is this package's matter, for which cyclictest
+    tells what the machine allows.
+    """
+    return label in (OURS, CYCLICTEST) or MODES[mode].compute is True
+
+
 def other_contender(label: str, python: Path, key: str, seconds: float) -> Contender:
     """Return one that drives the AGV and nothing else; ``key`` is the children's name for it."""
     return Contender(
@@ -120,8 +129,7 @@ def other_contender(label: str, python: Path, key: str, seconds: float) -> Conte
         script=CHILDREN,
         arguments=("--contender", key, "--seconds", str(seconds)),
         timeout_s=WARMUP_S + seconds + MARGIN_S + START_AND_END_S,
-        # Where else the planner can run is this package's matter.
-        workloads=tuple(name for name, mode in MODES.items() if mode.compute is True),
+        workloads=tuple(mode for mode in MODES if takes_part(label, mode)),
     )
 
 
@@ -168,7 +176,8 @@ def report(
     for mode in MODES:
         if mode in ran:
             labels = dict.fromkeys(run.contender for run in runs if run.workload == mode)
-            rows = agv_report.agv_rows(runs, mode, [*labels, *missing])
+            absent = [label for label in missing if takes_part(label, mode)]
+            rows = agv_report.agv_rows(runs, mode, [*labels, *absent])
             sections.append(render(rows))
     if not ran.isdisjoint(MODES):
         sections.append("\n".join(NOTES))

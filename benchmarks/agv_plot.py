@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING
 from matplotlib.figure import Figure
 
 from benchmarks.agv_report import (
-    CYCLICTEST,
     TARGETS,
     figure_of,
     figures_by_round,
     window_latencies_us,
 )
 from benchmarks.agv_workloads.scenario import MODES
-from benchmarks.harness import format_number, percentile
-from benchmarks.micro import OURS
+from benchmarks.harness import OURS, format_number, percentile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,12 +66,13 @@ def target_us(runs: Sequence[ChildRun], mode: str) -> tuple[float, str] | None:
     for line in TARGETS:
         if (line.mode, line.figure) != (mode, "latency_p99_us"):
             continue
-        if not line.relative:
+        reference = line.relative_to
+        if reference is None:
             return line.target.bound, f"p99 target {line.target.bound:g} µs"
-        limits = figures_by_round(runs, mode, CYCLICTEST, line.figure)
+        limits = figures_by_round(runs, reference.mode, reference.contender, line.figure)
         if limits:
             bound = line.target.bound * figure_of(limits).median
-            factor = f"{line.target.bound:g} x {CYCLICTEST}'s"
+            factor = f"{line.target.bound:g} x {reference.whose}"
             return bound, f"p99 target {factor}: {format_number(bound)} µs"
     return None
 

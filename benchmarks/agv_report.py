@@ -15,6 +15,7 @@ from itertools import pairwise
 from benchmarks import harness
 from benchmarks.agv_workloads.scenario import CRITICAL_CLASSES, CRITICAL_TIMEOUT_MS, MODES, SOAK
 from benchmarks.harness import (
+    OURS,
     ChildRun,
     Figure,
     Measure,
@@ -23,7 +24,6 @@ from benchmarks.harness import (
     percentile,
     percentile_of,
 )
-from benchmarks.micro import OURS
 
 Series = Mapping[str, Sequence[float]]
 
@@ -213,6 +213,16 @@ def _cell(values: Mapping[int, float], column: Column) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Reference:
+    """What a figure is divided by: the same one of somebody else, or in another mode."""
+
+    contender: str
+    mode: str
+    whose: str
+    """What to call it, as a possessive."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AgvTarget:
     """A bound for this package in one mode."""
 
@@ -221,9 +231,12 @@ class AgvTarget:
     unit: str
     figure: str
     target: Target
-    relative: bool = False
-    """Whether the figure is divided by cyclictest's of the same round."""
+    relative_to: Reference | None = None
+    """Whose figure of the same round it is divided by; None to take it as it is."""
 
+
+LIMIT = Reference(contender=CYCLICTEST, mode="idle", whose=f"{CYCLICTEST}'s")
+OURS_IDLE = Reference(contender=OURS, mode="idle", whose=f"{MODES['idle'].title}'s")
 
 TARGETS = (
     AgvTarget(
@@ -257,10 +270,32 @@ TARGETS = (
     AgvTarget(
         mode="idle",
         title="start latency p99",
-        unit="times cyclictest's p99",
+        unit=f"times {LIMIT.whose} p99",
         figure="latency_p99_us",
         target=Target(bound=3.0),
-        relative=True,
+        relative_to=LIMIT,
+    ),
+    AgvTarget(
+        mode="process",
+        title="motor ticks",
+        unit="% of releases",
+        figure="tick_percent",
+        target=Target(bound=99.9, sense="at least"),
+    ),
+    AgvTarget(
+        mode="process",
+        title="order violations",
+        unit="per 5 s",
+        figure="order_violations",
+        target=Target(bound=0.0),
+    ),
+    AgvTarget(
+        mode="process",
+        title="start latency p99",
+        unit=f"times {OURS_IDLE.whose} p99",
+        figure="latency_p99_us",
+        target=Target(bound=1.3),
+        relative_to=OURS_IDLE,
     ),
 )
 
@@ -268,8 +303,9 @@ TARGETS = (
 def target_figure(runs: Sequence[ChildRun], line: AgvTarget) -> Figure:
     """Return this package's figure for a target, over the rounds that have it."""
     ours = figures_by_round(runs, line.mode, OURS, line.figure)
-    if line.relative:
-        limit = figures_by_round(runs, line.mode, CYCLICTEST, line.figure)
+    reference = line.relative_to
+    if reference is not None:
+        limit = figures_by_round(runs, reference.mode, reference.contender, line.figure)
         ours = {number: ours[number] / limit[number] for number in ours if limit.get(number)}
     return figure_of(ours)
 
@@ -298,7 +334,11 @@ class Verdict:
 def verdicts(runs: Sequence[ChildRun]) -> list[Verdict]:
     """Return what was measured of the targets of all workloads that were run."""
     ran = {run.workload for run in runs}
-    limited = {run.workload for run in runs if run.contender == CYCLICTEST and run.error is None}
+    delivered = {(run.contender, run.workload) for run in runs if run.error is None}
+
+    def known(reference: Reference | None) -> bool:
+        return reference is None or (reference.contender, reference.mode) in delivered
+
     of_motor = [
         Verdict(
             title=f"{MODES[line.mode].title}: {line.title}",
@@ -306,7 +346,7 @@ def verdicts(runs: Sequence[ChildRun]) -> list[Verdict]:
             figure=target_figure(runs, line),
             target=line.target,
             every_round=line.target.bound == 0.0,
-            known=line.mode in limited or not line.relative,
+            known=known(line.relative_to),
         )
         for line in TARGETS
         if line.mode in ran

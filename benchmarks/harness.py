@@ -25,6 +25,8 @@ WORKLOADS = Path(__file__).resolve().with_name("workloads.py")
 SHARED_MEMORY = Path("/dev/shm")
 NAMESPACE = "HORUS_NAMESPACE"
 
+OURS = "this package"
+
 CALM_ATTEMPTS = 6
 """How often a workload is run at most to find the machine undisturbed."""
 
@@ -347,7 +349,13 @@ def table_rows(
     for measure in measures:
         figures = [summarize(runs, measure, contender) for contender in contenders]
         own = figures[0].median
-        cells = [measure.title, measure.unit, *map(str, figures)]
+        ran = {run.contender for run in runs if run.workload == measure.workload}
+        # A contender fails in what it takes part in only.
+        shown = [
+            str(figure) if label == contenders[0] or label in ran else "-"
+            for label, figure in zip(contenders, figures, strict=True)
+        ]
+        cells = [measure.title, measure.unit, *shown]
         if ratio:
             other = figures[1].median
             comparable = not (math.isnan(own) or math.isnan(other) or other == 0)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks import harness, peers
+from benchmarks import peers
 from benchmarks.harness import (
+    OURS,
+    REPOSITORY,
     Contender,
     Measure,
     Statistic,
@@ -19,11 +18,10 @@ from benchmarks.harness import (
     median_of,
     percentile_of,
 )
+from benchmarks.table import TableBenchmark
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-OURS = "this package"
 
 
 def overhead_per_tick(run: Mapping[str, Sequence[float]]) -> float:
@@ -169,96 +167,27 @@ MEASURES = (
         statistic=import_cost_of("import_names_ms"),
     ),
 )
-WORKLOADS = tuple(dict.fromkeys(measure.workload for measure in MEASURES))
 
 
-def parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Parse the options of this benchmark."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks micro", description=__doc__)
-    parser.add_argument(
-        "--peers",
-        action="store_true",
-        help=f"measure {peers.HORUS_ROBOTICS.requirement} too, in an environment made in .bench/",
-    )
-    parser.add_argument(
-        "--json", type=harness.output_file, metavar="FILE", help="write all raw samples"
-    )
-    parser.add_argument("--quick", action="store_true", help="one short round: smoke, not figures")
-    parser.add_argument(
-        "--rounds", type=harness.at_least_one, metavar="N", help="default 5; 1 with --quick"
-    )
-    parser.add_argument(
-        "--calm",
-        type=float,
-        default=100.0,
-        metavar="PERCENT",
-        help="repeat runs during which other processes used more than this of all CPUs",
-    )
-    parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        choices=WORKLOADS,
-        default=WORKLOADS,
-        metavar="WORKLOAD",
-        help=f"run only these: {', '.join(WORKLOADS)}",
-    )
-    options = parser.parse_args(argv)
-    if options.rounds is None:
-        options.rounds = 1 if options.quick else 5
-    return options
+def contenders(*, with_peers: bool) -> list[Contender]:
+    """Return this package as it is in the checkout, and the peer.
 
-
-def report(
-    runs: Sequence[harness.ChildRun],
-    contenders: Sequence[str],
-    facts: Mapping[str, str],
-    *,
-    only: Sequence[str],
-    markdown: bool,
-) -> str:
-    """Return the printed result: facts, table, and how to read it."""
-    measures = [measure for measure in MEASURES if measure.workload in only]
-    rows = harness.table_rows(runs, measures, contenders)
-    table = harness.render_markdown(rows) if markdown else harness.render_text(rows)
-    lines = harness.describe(runs, facts)
-    rounds = max((run.round for run in runs), default=0)
-    notes = f"Figures are medians over {rounds} round{'s' if rounds != 1 else ''}"
-    notes += " (lowest-highest round)." if rounds > 1 else "."
-    if len(contenders) > 1:
-        notes += " ratio = this package / peer."
-    notes += ' Lower is better, except for "ticks run".'
-    notes = "\n".join([notes, *harness.failures(runs)])
-    head = "  \n".join(lines) if markdown else "\n".join(lines)
-    return f"{head}\n\n{table}\n\n{notes}"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark and return 0 if every workload of this package delivered samples."""
-    options = parse(argv)
-    facts = harness.machine_facts()
-    contenders = [
-        Contender(label=OURS, python=Path(sys.executable), import_root=harness.REPOSITORY)
-    ]
-    if options.peers:
+    Raises:
+        PeerError: The peer cannot be had.
+    """
+    found = [Contender(label=OURS, python=Path(sys.executable), import_root=REPOSITORY)]
+    if with_peers:
         peer = peers.HORUS_ROBOTICS
-        try:
-            python = peer.interpreter()
-        except peers.PeerError as error:
-            print(error, file=sys.stderr)
-            return 2
-        contenders.append(Contender(label=peer.label, python=python))
-    runs = harness.run_rounds(
-        contenders,
-        options.only,
-        rounds=options.rounds,
-        quick=options.quick,
-        max_other_load_percent=options.calm,
-        progress=lambda line: print(line, file=sys.stderr, flush=True),
-    )
-    labels = [contender.label for contender in contenders]
-    print(report(runs, labels, facts, only=options.only, markdown=options.markdown))
-    if options.json is not None:
-        document = {"facts": facts, "quick": options.quick, "runs": [asdict(run) for run in runs]}
-        options.json.write_text(json.dumps(document, indent=1), encoding="utf-8")
-    return 1 if any(run.error for run in runs if run.contender == OURS) else 0
+        found.append(Contender(label=peer.label, python=peer.interpreter()))
+    return found
+
+
+BENCHMARK = TableBenchmark(
+    name="micro",
+    description=__doc__,
+    measures=MEASURES,
+    contenders=contenders,
+    peers_help=f"measure {peers.HORUS_ROBOTICS.requirement} too, in an environment made in .bench/",
+    reading='Lower is better, except for "ticks run".',
+)
+main = BENCHMARK.main

@@ -212,8 +212,9 @@ class Mode:
 MODES: Mapping[str, Mode] = {
     "idle": Mode(title="planner idle", plan=plan_idle),
     "thread": Mode(title="planner in a thread", plan=plan_busy),
+    "process": Mode(title="planner in a process", plan=plan_busy, compute="process"),
 }
-"""The modes of the AGV: workloads that every contender runs."""
+"""The modes of the AGV: workloads of every contender that has the choice they make."""
 REACTIONS = ("baton", "estop", "watchdog")
 """Workloads of this package only, measured along with the modes: functions in ``reaction.py``."""
 SOAK = "soak"

@@ -131,7 +131,7 @@ def test_the_table_says_failed_instead_of_inventing_a_figure() -> None:
 def test_the_report_names_every_failed_run() -> None:
     """A median over fewer rounds than were run is not passed off as one over all."""
     runs = [child_run(1, "ours", 1.0), child_run(2, "ours", error="it crashed")]
-    text = micro.report(runs, ["ours"], {}, only=[], markdown=False)
+    text = micro.BENCHMARK.report(runs, ["ours"], {}, only=[], markdown=False)
     assert "round 2, w of ours failed: it crashed" in text
 
 
@@ -200,11 +200,11 @@ def test_a_disturbed_run_is_repeated_and_its_calmest_attempt_counts(
 
 def test_options_default_to_five_rounds_and_quick_to_one() -> None:
     """An explicit number of rounds wins over both defaults."""
-    assert micro.parse([]).rounds == 5
-    assert micro.parse(["--quick"]).rounds == 1
-    assert micro.parse(["--quick", "--rounds", "3"]).rounds == 3
-    assert micro.parse([]).only == micro.WORKLOADS
-    assert micro.parse(["--only", "event", "import"]).only == ["event", "import"]
+    assert micro.BENCHMARK.parse([]).rounds == 5
+    assert micro.BENCHMARK.parse(["--quick"]).rounds == 1
+    assert micro.BENCHMARK.parse(["--quick", "--rounds", "3"]).rounds == 3
+    assert micro.BENCHMARK.parse([]).only == micro.BENCHMARK.workloads
+    assert micro.BENCHMARK.parse(["--only", "event", "import"]).only == ["event", "import"]
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_options_default_to_five_rounds_and_quick_to_one() -> None:
 def test_bad_options_are_refused_before_anything_is_measured(argv: list[str]) -> None:
     """The exit status is argparse's 2."""
     with pytest.raises(SystemExit) as refused:
-        micro.parse(argv)
+        micro.BENCHMARK.parse(argv)
     assert refused.value.code == 2
 
 
@@ -229,7 +229,7 @@ def test_the_command_passes_options_on_to_the_benchmark_it_names() -> None:
 
 def test_every_measure_belongs_to_a_workload_that_exists() -> None:
     """The table and the workloads name each other, and no two lines share a title."""
-    assert set(micro.WORKLOADS) == set(workloads.WORKLOADS)
+    assert set(micro.BENCHMARK.workloads) == set(workloads.WORKLOADS)
     titles = [measure.title for measure in micro.MEASURES]
     assert len(set(titles)) == len(titles)
 
@@ -270,7 +270,7 @@ def test_a_child_that_hangs_is_ended_with_all_that_it_started(tmp_path: Path) ->
 def test_a_quick_run_of_this_package_yields_every_figure_of_its_workload() -> None:
     """Samples come from this checkout and reduce to finite, positive numbers."""
     contender = Contender(
-        label=micro.OURS, python=Path(sys.executable), import_root=harness.REPOSITORY
+        label=harness.OURS, python=Path(sys.executable), import_root=harness.REPOSITORY
     )
     run = harness.run_child(contender, "tick_once", round_number=1, quick=True)
     assert run.error is None
@@ -278,6 +278,8 @@ def test_a_quick_run_of_this_package_yields_every_figure_of_its_workload() -> No
     figures = [measure.statistic(run.series) for measure in measures]
     assert len(figures) == 4
     assert all(math.isfinite(figure) and figure > 0 for figure in figures)
-    text = micro.report([run], [micro.OURS], {"date": "today"}, only=["tick_once"], markdown=False)
+    text = micro.BENCHMARK.report(
+        [run], [harness.OURS], {"date": "today"}, only=["tick_once"], markdown=False
+    )
     assert "tick_once per node, 100 nodes" in text
     assert "failed" not in text

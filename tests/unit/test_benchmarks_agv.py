@@ -21,8 +21,7 @@ import horus
 from benchmarks import agv, agv_report, cyclictest, harness, peers
 from benchmarks.agv_report import CYCLICTEST, MotorFigures, motor_figures
 from benchmarks.agv_workloads import scenario
-from benchmarks.harness import ChildRun
-from benchmarks.micro import OURS
+from benchmarks.harness import OURS, ChildRun
 from horus.spec import ExecutionClass
 
 MS = 1_000_000
@@ -195,7 +194,7 @@ def test_the_report_says_what_the_system_refused() -> None:
 def test_latency_is_judged_against_cyclictest_of_the_same_round() -> None:
     """The ratio is taken per round, and the median of the ratios counts."""
     runs = [our_run(1, 50), our_run(2, 100), limit_run(1, 25), limit_run(2, 25)]
-    line = next(line for line in agv_report.TARGETS if line.relative)
+    line = next(line for line in agv_report.TARGETS if line.relative_to is agv_report.LIMIT)
     figure = agv_report.target_figure(runs, line)
     assert (figure.median, figure.low, figure.high) == (3.0, 2.0, 4.0)
     row = agv_report.target_rows(runs)[-1]
@@ -208,6 +207,20 @@ def test_without_cyclictest_there_is_no_verdict() -> None:
     crashed = ChildRun(round=1, workload="idle", contender=OURS, error="it crashed")
     runs = [crashed, limit_run(1, 25)]
     assert agv_report.target_rows(runs)[-1][2:] == ("failed", "≤ 3", "missed")
+
+
+def test_a_planner_in_a_process_is_judged_against_an_idle_one_of_the_same_round() -> None:
+    """1.3 times its latency is met, a little more is missed; without an idle drive, neither."""
+
+    def verdict(latency_us: int, *more: ChildRun) -> tuple[str, ...]:
+        seen = list(range(3500))
+        runs = [our_run(1, latency_us, "process", safety_seen=seen), *more]
+        return agv_report.target_rows(runs)[-1][1:]
+
+    unit = "times planner idle's p99"
+    assert verdict(130, our_run(1, 100)) == (unit, "1.30", "≤ 1.3", "met")
+    assert verdict(131, our_run(1, 100)) == (unit, "1.31", "≤ 1.3", "missed")
+    assert verdict(130) == (unit, "-", "≤ 1.3", "-")
 
 
 def test_targets_of_a_busy_planner_are_met_up_to_their_bounds() -> None:
@@ -320,7 +333,7 @@ def test_options_default_to_three_rounds_of_five_seconds() -> None:
     """Everything but the soak is run, without peers."""
     options = agv.parse([])
     assert (options.rounds, options.seconds, options.peers, options.soak) == (3, 5.0, False, None)
-    assert options.only == ("idle", "thread", "baton", "estop", "watchdog")
+    assert options.only == ("idle", "thread", "process", "baton", "estop", "watchdog")
 
 
 @pytest.mark.parametrize(
@@ -330,7 +343,7 @@ def test_options_default_to_three_rounds_of_five_seconds() -> None:
         ["--seconds", "nan"],
         ["--rounds", "0"],
         ["--soak", "-1"],
-        ["--only", "process"],
+        ["--only", "gpu"],
         ["--plot", "no/such/dir/agv.png"],
     ],
 )
@@ -376,10 +389,10 @@ def test_only_this_package_is_measured_in_what_only_it_has(
     found, _ = agv.find_contenders(1.0, with_peers=False)
     found.append(agv.other_contender(PEER, Path(sys.executable), "threads", 1.0))
     runs = harness.run_rounds(
-        found, ["idle", "estop"], rounds=1, quick=False, progress=lambda _: None
+        found, ["idle", "process", "estop"], rounds=1, quick=False, progress=lambda _: None
     )
     order = [(run.workload, run.contender) for run in runs]
-    assert order == [("idle", OURS), ("idle", PEER), ("estop", OURS)]
+    assert order == [("idle", OURS), ("idle", PEER), ("process", OURS), ("estop", OURS)]
 
 
 @pytest.mark.parametrize(("crashed", "status"), [(OURS, 1), (PEER, 0)])
@@ -540,14 +553,15 @@ def test_a_frozen_node_is_reacted_to_while_it_is_frozen(monkeypatch: pytest.Monk
 
 
 @pytest.mark.realtime
-def test_a_short_drive_of_this_package_yields_every_figure() -> None:
+@pytest.mark.parametrize("mode", ["thread", "process"])
+def test_a_short_drive_of_this_package_yields_every_figure(mode: str) -> None:
     """Samples come from this checkout; the planner computes meanwhile."""
-    run = harness.run_child(agv.our_contender(0.3), "thread", round_number=1, quick=False)
+    run = harness.run_child(agv.our_contender(0.3), mode, round_number=1, quick=False)
     assert run.error is None
     figures = motor_figures(run.series)
     assert all(getattr(figures, name) is not None for name in MotorFigures.__slots__)
     assert figures.tick_percent is not None
     assert figures.tick_percent > 0
     text = agv.report([run], {}, {"date": "today"}, markdown=True)
-    assert "| planner in a thread: motor ticks |" in text
+    assert f"| planner in a {mode}: motor ticks |" in text
     assert "failed" not in text
