@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+
 import pytest
 
 from benchmarks import harness, service, service_load, service_workloads
