@@ -12,11 +12,14 @@ killed process leaves behind, the kernel frees.
 from __future__ import annotations
 
 import array
+import contextlib
+import errno
 import functools
 import os
 import pickle
 import socket
 import struct
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -32,8 +35,16 @@ _ALIGNMENT = 64
 _KEPT_FREE = 4
 """Segments that are kept for further messages although nobody uses them."""
 
+_LAST_STEPS_S = 1.0
+"""How long a sender or a receiver may take to notice that it has been hung up on [s]."""
+
 _MOST_LENT = 16
 """Segments that are expected back; further ones are the receiver's for good."""
+
+_ANCILLARY = socket.CMSG_SPACE(4)
+_CLOSE_ON_EXEC = getattr(socket, "MSG_CMSG_CLOEXEC", 0)
+_LOST = -1
+"""In place of a descriptor that did not arrive: this process has too many."""
 
 _INLINE, _GIVEN_AWAY = 0, 1
 _HEADER = struct.Struct("=IIQQ")
@@ -58,7 +69,12 @@ class Channel:
         self._loads = loads
         self._segments = _Segments()
         self._returned: deque[int] = deque()
+        self._buffer = bytearray(LARGE)
+        self._ahead = memoryview(self._buffer)[:0]
+        self._descriptors: deque[int] = deque()
         self._sending = threading.Lock()
+        self._receiving = threading.Lock()
+        self._closed = False
 
     def fileno(self) -> int:
         """Return the socket's descriptor."""
@@ -72,6 +88,8 @@ class Channel:
             OSError: The other end is gone.
         """
         with self._sending:
+            if self._closed:
+                raise BrokenPipeError("the channel is closed")
             self._send(message)
 
     def _send(self, message: Any) -> None:
@@ -108,64 +126,95 @@ class Channel:
             EOFError: The other end is gone.
             Exception: What the message's own classes raise.
         """
-        head, descriptor = self._receive_head()
-        count, returned, segment, size = _HEADER.unpack(head)
-        table = array.array("Q", self._receive_exactly(8 * (count + returned)))
-        self._segments.give_back(table[count:])
-        if segment:
-            assert descriptor is not None
-            payload = self._map(descriptor, segment, size)
-        else:
-            payload = memoryview(self._receive_exactly(size)).toreadonly()
-        parts, offset = [], 0
-        for length in table[:count]:
-            parts.append(payload[offset : offset + length])
-            offset += length + _padding(length)
-        del payload
+        with self._receiving:
+            parts = self._receive_parts()
         try:
             return self._loads(parts[0], parts[1:])
         except (EOFError, OSError) as exc:
             raise pickle.UnpicklingError(describe(exc)) from exc
 
     def close(self) -> None:
-        """Hang up: whoever waits at either end hears that the other one is gone."""
+        """Hang up: whoever waits at either end hears that the other one is gone.
+
+        Descriptors are given back once nobody uses them: their numbers may be another file's at
+        once. Somebody who does not notice, stuck in an object that is pickled, keeps them.
+        """
         try:
             self._socket.shutdown(socket.SHUT_RDWR)
         except OSError:
             pass  # the other end was faster
-        self._socket.close()
-        self._segments.close()
+        with contextlib.ExitStack() as stack:
+            for lock in (self._sending, self._receiving):
+                if not lock.acquire(timeout=_LAST_STEPS_S):
+                    return
+                stack.callback(lock.release)
+            self._closed = True
+            self._socket.close()
+            self._segments.close()
+            while self._descriptors:
+                self._close_descriptor()
 
-    def _map(self, descriptor: int, segment: int, size: int) -> memoryview:
-        given_away = segment == _GIVEN_AWAY
-        give_back = None if given_away else functools.partial(self._returned.append, segment)
+    def _receive_parts(self) -> list[memoryview]:
+        if self._closed:
+            raise EOFError("the channel is closed")
+        count, returned, segment, size = _HEADER.unpack(self._read(_HEADER.size))
+        table = array.array("Q", self._read(8 * (count + returned)))
+        if returned:
+            self._segments.give_back(table[count:])
+        payload = self._map(segment, size) if segment else memoryview(self._read(size))
+        parts, offset = [], 0
+        for length in table[:count]:
+            parts.append(payload[offset : offset + length].toreadonly())
+            offset += length + _padding(length)
+        return parts
+
+    def _map(self, segment: int, size: int) -> memoryview:
+        give_back = None
+        if segment != _GIVEN_AWAY:
+            give_back = functools.partial(self._returned.append, segment)
         try:
-            return map_file(descriptor, size, give_back)
+            if self._descriptors[0] == _LOST:
+                raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+            return map_file(self._descriptors[0], size, give_back)
+        except OSError as exc:
+            if give_back is not None:
+                give_back()
+            raise pickle.UnpicklingError(describe(exc)) from exc
         finally:
+            self._close_descriptor()
+
+    def _close_descriptor(self) -> None:
+        descriptor = self._descriptors.popleft()
+        if descriptor != _LOST:
             os.close(descriptor)
 
-    def _receive_head(self) -> tuple[bytes, int | None]:
-        try:
-            head, descriptors, _, _ = socket.recv_fds(self._socket, _HEADER.size, 1)
-        except ConnectionResetError:
-            head, descriptors = b"", []
-        if not head:
-            raise EOFError("the other end is gone")
-        missing = _HEADER.size - len(head)
-        return head + bytes(self._receive_exactly(missing)), next(iter(descriptors), None)
+    def _read(self, size: int) -> bytearray:
+        """Return the next bytes from the socket, this many."""
+        data = bytearray()
+        while True:
+            taken = self._ahead[: size - len(data)]
+            data += taken
+            self._ahead = self._ahead[len(taken) :]
+            if len(data) == size:
+                return data
+            self._read_ahead()
 
-    def _receive_exactly(self, size: int) -> bytearray:
-        data = bytearray(size)
-        view = memoryview(data)
-        while view:
-            try:
-                count = self._socket.recv_into(view)
-            except ConnectionResetError:
-                count = 0
-            if not count:
-                raise EOFError("the other end is gone")
-            view = view[count:]
-        return data
+    def _read_ahead(self) -> None:
+        """Take what has arrived, in one system call; wait if there is nothing."""
+        try:
+            count, ancillary, flags, _ = self._socket.recvmsg_into(
+                [self._buffer], _ANCILLARY, _CLOSE_ON_EXEC
+            )
+        except ConnectionResetError:
+            count = 0
+        if not count:
+            raise EOFError("the other end is gone")
+        self._ahead = memoryview(self._buffer)[:count]
+        # The kernel ends what it returns with the message that a descriptor came with: one at most.
+        for _, _, data in ancillary:
+            self._descriptors.append(int.from_bytes(data, sys.byteorder))
+        if flags & socket.MSG_CTRUNC:
+            self._descriptors.append(_LOST)
 
 
 class _Segment(NamedTuple):
@@ -179,23 +228,19 @@ class _Segment(NamedTuple):
 class _Segments:
     """The segments that a sender has made: lent to a message, or free for another.
 
-    Thread: one at a time.
+    Thread: any, one at a time for `fill`.
     """
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._lent: dict[int, _Segment] = {}
         self._free: list[_Segment] = []
         self._last = _GIVEN_AWAY
 
     def fill(self, parts: list[memoryview], size: int) -> _Segment | None:
         """Write parts to a segment and return it; None where there are none."""
-        fitting = [segment for segment in self._free if segment.size >= size]
         try:
-            if fitting:
-                segment = min(fitting, key=lambda segment: segment.size)
-                self._free.remove(segment)
-            else:
-                segment = self._make(size)
+            segment = self._take(size) or self._make(size)
         except (AttributeError, OSError):  # not on this platform; or no descriptors
             return None
         try:
@@ -207,22 +252,34 @@ class _Segments:
             os.close(segment.descriptor)
             return None
         if segment.number != _GIVEN_AWAY:
-            self._lent[segment.number] = segment
+            with self._lock:
+                self._lent[segment.number] = segment
         return segment
 
     def give_back(self, numbers: array.array[int]) -> None:
         """Take note that nobody looks at these any more."""
-        for number in numbers:
-            self._free.append(self._lent.pop(number))
-        while len(self._free) > _KEPT_FREE:
-            os.close(self._free.pop(0).descriptor)
+        with self._lock:
+            for number in numbers:
+                self._free.append(self._lent.pop(number))
+            while len(self._free) > _KEPT_FREE:
+                os.close(self._free.pop(0).descriptor)
 
     def close(self) -> None:
         """Give all of them back to the kernel; what is mapped stays until it is not."""
-        for segment in (*self._lent.values(), *self._free):
-            os.close(segment.descriptor)
-        self._lent.clear()
-        self._free.clear()
+        with self._lock:
+            for segment in (*self._lent.values(), *self._free):
+                os.close(segment.descriptor)
+            self._lent.clear()
+            self._free.clear()
+
+    def _take(self, size: int) -> _Segment | None:
+        with self._lock:
+            fitting = [segment for segment in self._free if segment.size >= size]
+            if not fitting:
+                return None
+            segment = min(fitting, key=lambda segment: segment.size)
+            self._free.remove(segment)
+            return segment
 
     def _make(self, size: int) -> _Segment:
         descriptor = os.memfd_create("horus", os.MFD_CLOEXEC)

@@ -1,15 +1,15 @@
 """What a scheduler and a worker say to each other.
 
 The scheduler sends a `Place` and a `Setup` first, and then `Call`s, one at a time. The
-worker answers each with a `Done`; in between come, in their order, whatever the callback does:
-a message it `Sent`, a line it `Logged`, a stop it asks for, a question.
+worker answers the setup and each call with a `Done`; in between come, in their order,
+whatever the callback does: a message it `Sent`, a line it `Logged`, a stop it asks for, a
+question.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from horus.clock import Moment
 from horus.snapshot import Frozen
@@ -18,8 +18,7 @@ Inputs = Sequence[tuple[str, Sequence[Frozen]]]
 """What has arrived since the last call: topics with their messages, oldest first."""
 
 
-@dataclass(slots=True)
-class Place:
+class Place(NamedTuple):
     """Where a worker lives: what it needs to understand the rest."""
 
     parent: int
@@ -30,8 +29,7 @@ class Place:
     """Where to run; None for anywhere."""
 
 
-@dataclass(slots=True)
-class Setup:
+class Setup(NamedTuple):
     """What a worker is to run."""
 
     levels: Mapping[str, int]
@@ -46,8 +44,7 @@ class Setup:
     """The newest message of each topic that the node receives."""
 
 
-@dataclass(slots=True)
-class Call:
+class Call(NamedTuple):
     """Run a callback."""
 
     phase: str
@@ -55,46 +52,40 @@ class Call:
     inputs: Inputs = ()
 
 
-@dataclass(slots=True)
-class Done:
-    """The callback has returned, or raised `error` (see `pickling.pack_error`)."""
+class Done(NamedTuple):
+    """The setup or the callback is through, or has raised `error` (see `pickling.pack_error`)."""
 
     error: bytes | None
     queues: Sequence[tuple[str, int, int]]
     """Topics with how many messages were received of them in all, and how many wait."""
 
 
-@dataclass(slots=True)
-class Sent:
+class Sent(NamedTuple):
     """The callback has sent a message, isolated already."""
 
     topic: str
     message: Frozen
 
 
-@dataclass(slots=True)
-class Logged:
+class Logged(NamedTuple):
     """The callback has logged something; the fields of its record."""
 
     record: Mapping[str, Any]
 
 
-@dataclass(slots=True)
-class Stop:
+class Stop(NamedTuple):
     """The callback asks for an ordered stop."""
 
     reason: str
 
 
-@dataclass(slots=True)
-class Open:
+class Open(NamedTuple):
     """The callback receives from a topic it did not declare; answered with its newest message."""
 
     topic: str
 
 
-@dataclass(slots=True)
-class Fetch:
+class Fetch(NamedTuple):
     """The worker does not know something of `__main__`; answered with it, by value."""
 
     name: str

@@ -61,6 +61,7 @@ class WorkerProcess:
         self._over = threading.Event()
         self._status = 0
         self._stacks = os.memfd_create("horus-stacks") if hasattr(os, "memfd_create") else -1
+        self._looking = threading.Lock()
         turns, their_turns = socket.socketpair()
         aside, their_aside = socket.socketpair()
         self.turns = Channel(turns, dumps, loads)
@@ -102,9 +103,10 @@ class WorkerProcess:
         """Hang up."""
         self.turns.close()
         self.aside.close()
-        if self._stacks >= 0:
-            os.close(self._stacks)
-            self._stacks = -1
+        with self._looking:
+            if self._stacks >= 0:
+                os.close(self._stacks)
+                self._stacks = -1
 
     def stack(self) -> traceback.StackSummary | None:
         """Return where its main thread is; None if it does not say in 10 ms.
@@ -112,9 +114,10 @@ class WorkerProcess:
         Written by `faulthandler` in a signal handler: also of an extension that holds
         the interpreter.
         """
-        file = self._stacks
-        if file < 0:
-            return None
+        with self._looking:
+            return None if self._stacks < 0 else self._look(self._stacks)
+
+    def _look(self, file: int) -> traceback.StackSummary:
         # The two share a file offset.
         os.ftruncate(file, 0)
         os.lseek(file, 0, os.SEEK_SET)
@@ -242,8 +245,10 @@ class RemoteNode:
         try:
             process.turns.send(place)
             process.turns.send(setup)
-        except OSError as exc:
+            done, failed = self._listen(process.turns)
+        except (EOFError, OSError) as exc:
             raise process.death() from exc
+        _raise_first(done, failed)
 
     def _ended(self, process: WorkerProcess) -> None:
         """Act on the end of a worker, unless a callback has met it already."""
@@ -291,30 +296,31 @@ class RemoteNode:
 
     def _converse(self, process: WorkerProcess, channel: Channel, phase: str) -> None:
         in_turn = channel is process.turns
-        call = messages.Call(phase, self._live.tick_context.moment())
-        if in_turn:
-            call.inputs = self._inputs()
+        inputs = self._inputs() if in_turn else ()
+        call = messages.Call(phase, self._live.tick_context.moment(), inputs)
         try:
-            failed = self._send(call, channel)
-            while True:
-                try:
-                    said = channel.receive()
-                except (EOFError, OSError):
-                    raise
-                except Exception as exc:  # a message's own class
-                    failed = exc
-                    continue
-                if isinstance(said, messages.Done):
-                    break
-                self._hear(said, channel)
+            unsent = self._send(call, channel)
+            done, failed = self._listen(channel)
         except (EOFError, OSError) as exc:
             raise process.death() from exc
         if in_turn:
-            self._count(said)
-        if said.error is not None:
-            raise unpack_error(said.error)
-        if failed is not None:
-            raise failed
+            self._count(done)
+        _raise_first(done, failed or unsent)
+
+    def _listen(self, channel: Channel) -> tuple[messages.Done, Exception | None]:
+        """Hear what the worker says until it is done; return what could not be understood, too."""
+        failed: Exception | None = None
+        while True:
+            try:
+                said = channel.receive()
+            except (EOFError, OSError):
+                raise
+            except Exception as exc:  # a message's own class
+                failed = exc
+                continue
+            if isinstance(said, messages.Done):
+                return said, failed
+            self._hear(said, channel)
 
     def _send(self, call: messages.Call, channel: Channel) -> Exception | None:
         """Ask for a callback; return what is wrong with messages that cannot travel."""
@@ -328,8 +334,7 @@ class RemoteNode:
                 raise
             for topic, _ in refused:
                 self._subscriptions()[topic].away -= 1
-            call.inputs = kept
-            channel.send(call)
+            channel.send(call._replace(inputs=kept))
             topic, (payload, _) = refused[0]
             return WorkerError(
                 f"topic {topic!r}: a {type(payload).__name__} cannot go to the worker process of "
@@ -395,3 +400,11 @@ class RemoteNode:
     def _subscriptions(self) -> dict[str, Subscription]:
         inputs = self._live.core.inputs.copy().items()
         return {topic: subscription for topic, subscription in inputs if isinstance(topic, str)}
+
+
+def _raise_first(done: messages.Done, failed: Exception | None) -> None:
+    """Raise what the callback has raised, or else what went wrong with its messages."""
+    if done.error is not None:
+        raise unpack_error(done.error)
+    if failed is not None:
+        raise failed

@@ -16,7 +16,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import cloudpickle
@@ -60,12 +60,14 @@ class Worker:
     """
 
     def __init__(self, turns: int, aside: int) -> None:
-        """Wait for the setup, and take the node out of its parcel."""
+        """Take the sockets."""
         self._conversation = threading.local()
         self._turns = self._channel(turns)
         self._aside = self._channel(aside)
         self._conversation.channel = self._turns
-        self._settle(self._turns.receive())
+
+    def _set_up(self) -> None:
+        """Take the node out of its parcel."""
         setup: messages.Setup = self._turns.receive()
         self._listen(setup.levels)
         self._core = core_of(cloudpickle.loads(setup.parcel))
@@ -94,7 +96,12 @@ class Worker:
                 os_rt.run_on(place.cores)
 
     def serve(self) -> None:
-        """Run callbacks until the scheduler hangs up."""
+        """Set up, and run callbacks until the scheduler hangs up."""
+        self._settle(self._turns.receive())
+        error = _attempt(self._set_up)
+        self.say(messages.Done(error, ()))
+        if error is not None:
+            return
         threading.Thread(target=self._serve_aside, name="horus-aside", daemon=True).start()
         while True:
             call: messages.Call = self._turns.receive()
@@ -145,16 +152,15 @@ class Worker:
                 subscription.queue.append(frozen)
 
     def _run(self, phase: str, context: contextvars.Context) -> messages.Done:
-        error: bytes | None = None
         callback = self._core.callbacks[phase]
-        try:
+
+        def call() -> None:
             result = None if callback is None else context.run(callback)
             if inspect.iscoroutine(result):
                 result.close()
                 raise TypeError(f"{phase}() returned a coroutine that nobody would await")
-        except BaseException as exc:
-            exc.__traceback__ = _in_callback(exc)
-            error = pack_error(exc)
+
+        error = _attempt(call)
         queues = [
             (topic, subscription.received, len(subscription.queue))
             for topic, subscription in self._core.inputs.items()
@@ -235,6 +241,16 @@ class _Forwarder(logging.Handler):
             fields["exc_text"] = logging.Formatter().formatException(record.exc_info)
         with contextlib.suppress(Exception):  # the scheduler is gone, or a field cannot travel
             self._worker.say(messages.Logged(fields))
+
+
+def _attempt(function: Callable[[], None]) -> bytes | None:
+    """Return the error that a function raises, packed; None if it raises none."""
+    try:
+        function()
+    except BaseException as exc:
+        exc.__traceback__ = _in_callback(exc)
+        return pack_error(exc)
+    return None
 
 
 def _in_callback(exc: BaseException) -> Any:

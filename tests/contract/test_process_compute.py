@@ -9,8 +9,10 @@ import logging
 import os
 import signal
 import socket
+import sys
 import threading
 import time
+import types
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -430,6 +432,20 @@ def test_init_that_fails_excludes_the_node_and_leaves_no_process(make, caplog):
     assert "no camera" in caplog.text
 
 
+def test_a_module_that_the_worker_cannot_import_is_named(make, caplog):
+    """As by any import, and the node is excluded."""
+    sched = make()
+    module = types.ModuleType("made_by_hand")
+    exec("def tick(node): pass", module.__dict__)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, module.__name__, module)
+        sched.add(worker("worker", module.tick))
+        sched.add(Node("other", nothing, rate=50))
+        run_until(sched, lambda: stats(sched, "other")["total_ticks"] > 3)
+    assert stats(sched)["total_ticks"] == 0
+    assert "No module named 'made_by_hand'" in caplog.text
+
+
 # -- what a process adds -----------------------------------------------------------------
 
 
@@ -780,14 +796,18 @@ def test_a_parent_that_is_killed_leaves_no_worker():
     assert done.stderr == ""
 
 
-def test_a_program_of_its_own_with_classes_in_main(tmp_path):
-    """No `if __name__ == "__main__"` is needed, and classes of the program travel both ways."""
+@pytest.mark.parametrize("kind", ["None", "Plan"])
+def test_a_program_of_its_own_with_classes_in_main(tmp_path, kind):
+    """No `if __name__ == "__main__"` is needed, and classes of the program travel both ways.
+
+    Also those that topics are declared with.
+    """
     program = tmp_path / "robot.py"
     program.write_text(
         """
 import dataclasses, os
 import horus
-from horus import Node, Scheduler
+from horus import Node, Pub, Scheduler, Sub
 
 @dataclasses.dataclass
 class Plan:
@@ -810,11 +830,13 @@ def hear(node):
         node.request_stop()
 
 sched = Scheduler()
-sched.add(Node("asker", ask, rate=50, pubs=["ask"]))
-sched.add(Node("planner", tick, rate=50, compute="process", subs=["ask"], pubs=["answer"]))
+kind = KIND
+ports = dict(subs=[Sub("ask", kind)], pubs=[Pub("answer", kind)])
+sched.add(Node("asker", ask, rate=50, pubs=[Pub("ask", kind)]))
+sched.add(Node("planner", tick, rate=50, compute="process", **ports))
 sched.add(Node("hearer", hear, on="answer", subs=["answer"], failure_policy="fatal"))
 sched.run(duration=20)
-"""
+""".replace("KIND", kind)
     )
     done = run_program(f"""
         import runpy, subprocess, sys

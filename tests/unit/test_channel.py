@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gc
 import os
+import resource
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -126,6 +128,60 @@ def test_where_no_segments_can_be_had_messages_go_by_socket(
     assert np.array_equal(pass_on(pair, image), image)
 
 
+def test_out_of_descriptors_where_a_segment_arrives(pair: Pair) -> None:
+    """The message is lost, and named; the segment goes back, and the next message arrives."""
+    image = np.arange(10 * LARGE)
+    pair[0].send(image)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (pair[0].fileno(), hard))
+    try:
+        with pytest.raises(Exception, match="Too many open files") as failure:
+            pair[1].receive()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert not isinstance(failure.value, OSError)
+    pair[1].send("given back")
+    assert pair[0].receive() == "given back"
+    before = len(os.listdir("/proc/self/fd"))
+    assert np.array_equal(pass_on(pair, image), image)
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_small_and_large_messages_that_wait_arrive_in_order(pair: Pair) -> None:
+    """However many were sent before the first is received."""
+    sent = [number if number % 3 else np.full(LARGE, number) for number in range(12)]
+    for message in sent:
+        pair[0].send(message)
+    for number in range(12):
+        assert np.max(pair[1].receive()) == number
+
+
+def test_two_threads_that_send_while_a_third_receives(pair: Pair) -> None:
+    """What each has sent arrives whole, and in its order."""
+
+    def talk(name: str) -> None:
+        for number in range(200):
+            pair[0].send((name, number, np.full(LARGE if number % 10 == 0 else 10, number)))
+            pair[0].receive()
+
+    def answer() -> None:
+        for _ in range(400):
+            name, number, content = pair[1].receive()
+            arrived[name].append(number)
+            assert np.all(content == number)
+            del content
+            pair[1].send(None)
+
+    arrived: dict[str, list[int]] = {"one": [], "other": []}
+    threads = [threading.Thread(target=talk, args=(name,)) for name in arrived]
+    threads.append(threading.Thread(target=answer))
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert arrived == {"one": list(range(200)), "other": list(range(200))}
+
+
 def test_out_of_memory_in_the_middle(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """What has been written is given up, and the message goes by socket."""
 
@@ -146,6 +202,44 @@ def test_the_other_end_is_gone(pair: Pair) -> None:
         pair[0].receive()
     with pytest.raises(BrokenPipeError):
         pair[0].send("anybody there?")
+
+
+@pytest.mark.parametrize("doing", ["send", "receive"])
+def test_hanging_up_on_who_is_in_the_middle(doing: str) -> None:
+    """Who waits hears it at once; descriptors are given back when nobody uses them any more."""
+    before = len(os.listdir("/proc/self/fd"))
+    pair = open_pair()
+    ended: list[BaseException] = []
+
+    def wait() -> None:
+        try:
+            while True:  # until the socket takes no more; or at once
+                if doing == "send":
+                    pair[0].send(bytes(LARGE - 1000))
+                else:
+                    pair[0].receive()
+        except (EOFError, OSError) as exc:
+            ended.append(exc)
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    time.sleep(0.05)
+    pair[0].close()
+    thread.join(5.0)
+    assert not thread.is_alive()
+    assert isinstance(ended[0], BrokenPipeError if doing == "send" else EOFError)
+    pair[1].close()
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_channel_that_is_closed_says_so(pair: Pair) -> None:
+    """Its descriptor may be another file's by now."""
+    pair[0].close()
+    pair[0].close()
+    with pytest.raises(BrokenPipeError):
+        pair[0].send("anybody there?")
+    with pytest.raises(EOFError):
+        pair[0].receive()
 
 
 class Unreadable:
