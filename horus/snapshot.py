@@ -197,6 +197,24 @@ def _freeze_tuple(value: tuple[Any, ...], depth: int) -> Frozen:
     return build(payload), functools.partial(_thaw_tuple, build, thaws) if thaws else None
 
 
+_COMMON_THAWS: tuple[Thaw, ...] = (None, dict.copy, list.copy)
+
+
+def shorten(frozen: Frozen) -> tuple[Any, Any]:
+    """Return a frozen value, a number in place of a common way to copy it.
+
+    Functions are slow to pickle: by name, which has to be looked for, also in a cold cache.
+    """
+    payload, thaw = frozen
+    return payload, _COMMON_THAWS.index(thaw) if thaw in _COMMON_THAWS else thaw
+
+
+def lengthen(short: tuple[Any, Any]) -> Frozen:
+    """Return the frozen value that `shorten` was given."""
+    payload, thaw = short
+    return payload, _COMMON_THAWS[thaw] if isinstance(thaw, int) else thaw
+
+
 def _thaw_items(thaws: tuple[tuple[Any, Any], ...], payload: Any) -> Any:
     fresh = payload.copy()
     for key, thaw in thaws:

@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from horus.clock import Moment
-from horus.snapshot import Frozen
+from horus.clock import Moment, Position
+from horus.snapshot import Frozen, lengthen, shorten
 
 Inputs = Sequence[tuple[str, Sequence[Frozen]]]
 """What has arrived since the last call: topics with their messages, oldest first."""
@@ -89,3 +89,38 @@ class Fetch(NamedTuple):
     """The worker does not know something of `__main__`; answered with it, by value."""
 
     name: str
+
+
+_KINDS = (Call, Done, Sent, Logged, Stop, Open, Fetch)
+_NUMBERS = {kind: number for number, kind in enumerate(_KINDS)}
+
+
+def to_plain(message: Any) -> tuple[Any, ...]:
+    """Return a message as a tuple, without classes of ours.
+
+    A class is pickled by its name. To look for it takes longer than everything else about a small
+    message, a hundred microseconds in a worker that has slept since its last tick.
+    """
+    fields: tuple[Any, ...] = message
+    match message:
+        case Call(phase, moment, inputs):
+            position, *rest = moment
+            short = [(topic, list(map(shorten, arrived))) for topic, arrived in inputs]
+            fields = (phase, (tuple(position), *rest), short)
+        case Sent(topic, frozen):
+            fields = (topic, shorten(frozen))
+    return (_NUMBERS[type(message)], *fields)
+
+
+def from_plain(plain: tuple[Any, ...]) -> Any:
+    """Return the message that `to_plain` was given."""
+    number, *fields = plain
+    kind = _KINDS[number]
+    if kind is Call:
+        phase, (position, *rest), short = fields
+        inputs = [(topic, list(map(lengthen, arrived))) for topic, arrived in short]
+        return Call(phase, Moment(Position(*position), *rest), inputs)
+    if kind is Sent:
+        topic, short = fields
+        return Sent(topic, lengthen(short))
+    return kind(*fields)

@@ -312,7 +312,7 @@ class RemoteNode:
         failed: Exception | None = None
         while True:
             try:
-                said = channel.receive()
+                said = messages.from_plain(channel.receive())
             except (EOFError, OSError):
                 raise
             except Exception as exc:  # a message's own class
@@ -325,7 +325,7 @@ class RemoteNode:
     def _send(self, call: messages.Call, channel: Channel) -> Exception | None:
         """Ask for a callback; return what is wrong with messages that cannot travel."""
         try:
-            channel.send(call)
+            channel.send(messages.to_plain(call))
         except (EOFError, OSError):
             raise
         except Exception as exc:
@@ -334,7 +334,7 @@ class RemoteNode:
                 raise
             for topic, _ in refused:
                 self._subscriptions()[topic].away -= 1
-            channel.send(call._replace(inputs=kept))
+            channel.send(messages.to_plain(call._replace(inputs=kept)))
             topic, (payload, _) = refused[0]
             return WorkerError(
                 f"topic {topic!r}: a {type(payload).__name__} cannot go to the worker process of "

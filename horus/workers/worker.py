@@ -104,7 +104,7 @@ class Worker:
             return
         threading.Thread(target=self._serve_aside, name="horus-aside", daemon=True).start()
         while True:
-            call: messages.Call = self._turns.receive()
+            call = messages.from_plain(self._turns.receive())
             self._deliver(call.inputs)
             self._tick_context.follow(call.moment)
             self.say(self._run(call.phase, self._context))
@@ -113,13 +113,14 @@ class Worker:
         self._conversation.channel = self._aside
         with contextlib.suppress(EOFError, BrokenPipeError):
             while True:
-                call: messages.Call = self._aside.receive()
+                call = messages.from_plain(self._aside.receive())
                 # A copy: a tick that does not end still holds the node's own context.
                 self.say(self._run(call.phase, self._context.copy()))
 
     def say(self, message: Any) -> None:
         """Tell the scheduler something, in the conversation of the calling thread."""
-        getattr(self._conversation, "channel", self._turns).send(message)
+        channel: Channel = getattr(self._conversation, "channel", self._turns)
+        channel.send(messages.to_plain(message))
 
     def ask(self, question: Any) -> Any:
         """Ask the scheduler something and wait for the answer.
@@ -130,7 +131,7 @@ class Worker:
         channel: Channel | None = getattr(self._conversation, "channel", None)
         if channel is None:
             raise StateError("topics are opened in callbacks; declare them with subs= and pubs=")
-        channel.send(question)
+        channel.send(messages.to_plain(question))
         return channel.receive()
 
     def _channel(self, descriptor: int) -> Channel:
