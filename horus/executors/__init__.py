@@ -22,6 +22,6 @@ def make_executors(
         ExecutionClass.BEST_EFFORT: BestEffortExecutor(bridge, cycle),
         ExecutionClass.EVENT: EventExecutor(bridge, cycle, real_time),
         ExecutionClass.ASYNC_IO: AsyncIoExecutor(bridge, cycle),
-        ExecutionClass.RT: RtExecutor(cycle, real_time),
+        ExecutionClass.RT: RtExecutor(bridge, cycle, real_time),
         ExecutionClass.COMPUTE: ComputeExecutor(bridge, cycle, real_time),
     }

@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections import deque
+from collections.abc import Callable
 
 from horus import clock, os_rt
 from horus.executors.thread import NodeThread, ThreadExecutor
 from horus.live import LiveNode
+from horus.loop.bridge import Bridge
 from horus.loop.cycle import Cycle
 from horus.loop.realtime import RealTime
 from horus.tick_path import build_tick
@@ -42,8 +44,14 @@ class RtThread(NodeThread):
     thread wakes up that much early, and by the release it has the interpreter.
     """
 
-    def __init__(self, live: LiveNode, real_time: RealTime) -> None:
-        """Prepare a thread that does not release yet."""
+    def __init__(self, live: LiveNode, real_time: RealTime, wake_loop: Callable[[], None]) -> None:
+        """Prepare a thread that does not release yet.
+
+        Args:
+            live: Its node.
+            real_time: What the thread enters.
+            wake_loop: Called on this thread when a release is over that the loop waits for.
+        """
         super().__init__(live, self._enter_real_time)
         self.engaged = False
         self.priority: int | None = None
@@ -55,7 +63,10 @@ class RtThread(NodeThread):
         self.done_ns = clock.NEVER
         """The release of the last tick that is over [ns]: a skipped one frees nobody."""
         self.grid = live.grid()
+        self.loop_waits_for_ns = clock.FOREVER_NS
+        """The earliest release whose end the loop waits for [ns]."""
         self._waiting: deque[RtThread] = deque()
+        self._wake_loop = wake_loop
         self._inherited = False
         self._real_time = real_time
         self._run_tick = build_tick(live)
@@ -152,7 +163,7 @@ class RtThread(NodeThread):
 
     def _wait_for_baton(self, predecessor: RtThread, release_ns: int, now_ns: int) -> bool:
         """Sleep until a predecessor is done; return False if this node must not wait for it."""
-        limit_ns = self._latest_start_ns(release_ns)
+        limit_ns = _latest_start_ns(self.live, release_ns)
         behind = predecessor.is_behind(release_ns, now_ns)
         if now_ns >= limit_ns and not behind:
             limit_ns = self._last_chance_ns(release_ns, limit_ns, now_ns)
@@ -186,21 +197,6 @@ class RtThread(NodeThread):
         """Return whether a tick is in progress that began before an instant [ns]."""
         context = self.live.tick_context
         return context.ticking and context.start_ns < instant_ns
-
-    def _latest_start_ns(self, release_ns: int) -> int:
-        """Return how long this node can wait and still meet its deadline [ns].
-
-        With a budget that was given, until the deadline less the budget. One that
-        was derived, 80 % of the period, is an upper bound rather than an estimate:
-        then the other 20 % are kept back.
-        """
-        spec = self.live.spec
-        if spec.budget_given and spec.budget_ns is not None:
-            reserve_ns = spec.budget_ns
-        else:
-            reserve_ns = self.live.period_ns // 5
-        limit_ns = min(self.live.limits.deadline_ns, self.live.period_ns)
-        return release_ns + max(0, limit_ns - reserve_ns)
 
     def is_behind(self, release_ns: int, now_ns: int) -> bool:
         """Return whether this node still ticks for an earlier release, past its deadline."""
@@ -253,26 +249,46 @@ class RtThread(NodeThread):
             try:
                 waiting = self._waiting.popleft()
             except IndexError:  # the other one has taken it
-                return
+                break
             if waiting._release_ns <= done_ns:
                 waiting.unpark()
             elif waiting.engaged:
                 self._waiting.append(waiting)  # for a later release: let it sleep
+        if self.loop_waits_for_ns <= done_ns:
+            self.loop_waits_for_ns = clock.FOREVER_NS
+            self._wake_loop()
+
+
+def _latest_start_ns(live: LiveNode, release_ns: int) -> int:
+    """Return how long a node can wait and still meet its deadline [ns].
+
+    With a budget that was given, until the deadline less the budget. One that
+    was derived, 80 % of the period, is an upper bound rather than an estimate:
+    then the other 20 % are kept back.
+    """
+    spec = live.spec
+    if spec.budget_given and spec.budget_ns is not None:
+        reserve_ns = spec.budget_ns
+    else:
+        reserve_ns = live.period_ns // 5
+    limit_ns = min(live.limits.deadline_ns, live.period_ns)
+    return release_ns + max(0, limit_ns - reserve_ns)
 
 
 class RtExecutor(ThreadExecutor[RtThread]):
     """Gives every node an `RtThread`."""
 
-    def __init__(self, cycle: Cycle, real_time: RealTime) -> None:
+    def __init__(self, bridge: Bridge, cycle: Cycle, real_time: RealTime) -> None:
         """Serve the nodes of one run; `cycle` is to give way to them."""
         super().__init__()
+        self._wake_loop = functools.partial(bridge.post, cycle.run_due)
         self._cycle = cycle
         self._real_time = real_time
         self._in_order: list[RtThread] = []
 
     def make_thread(self, live: LiveNode) -> RtThread:
         """Return the node's thread, not started."""
-        return RtThread(live, self._real_time)
+        return RtThread(live, self._real_time, self._wake_loop)
 
     def engage(self, live: LiveNode, from_ns: int) -> None:
         """Let the thread release the node."""
@@ -317,4 +333,28 @@ class RtExecutor(ThreadExecutor[RtThread]):
             thread.priority_after = highest
             if thread.priority is not None:
                 highest = max(highest or 0, thread.priority)
-        self._cycle.gives_way = bool(self._in_order)
+        self._cycle.hold_up = self._hold_up if self._in_order else None
+
+    def _hold_up(self, live: LiveNode, release_ns: int, now_ns: int) -> int | None:
+        """Return until when a node of the loop's has to wait for Rt nodes [ns]; None: no more.
+
+        It waits for those before it in order that are due at the same instant, for as
+        long as an Rt node would.
+
+        Thread: loop.
+        """
+        for thread in self._in_order:
+            if thread.live.rank > live.rank:
+                break
+            if thread.done_ns >= release_ns or not thread.grid.has(release_ns):
+                continue
+            limit_ns = min(_latest_start_ns(live, release_ns), live.timeline.end_ns - 1)
+            if now_ns >= limit_ns or thread.is_behind(release_ns, now_ns):
+                live.order_violated(thread.live)
+                break
+            thread.loop_waits_for_ns = min(thread.loop_waits_for_ns, release_ns)
+            # Looked at again now that the thread can see us.
+            if thread.done_ns < release_ns:
+                live.waited_until_ns = limit_ns
+                return limit_ns
+        return None

@@ -113,6 +113,12 @@ class ReleaseQueue:
         heapq.heapreplace(self._heap, (following_ns, rank, serial, release))
         return release.live, release_ns
 
+    def put_back(self, live: LiveNode, release_ns: int) -> None:
+        """Make a release [ns] that was handed out due again; unknown nodes are ignored."""
+        release = self._of_node.get(live)
+        if release is not None:
+            self.add(live, release.rank, release_ns)
+
     def clear(self) -> None:
         """Forget all nodes."""
         self._heap.clear()
