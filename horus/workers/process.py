@@ -143,6 +143,7 @@ class WorkerProcess:
             process = subprocess.Popen(
                 [
                     sys.executable,
+                    *_interpreter_options(),
                     "-c",
                     _CODE,
                     str(_ROOT),
@@ -400,6 +401,15 @@ class RemoteNode:
     def _subscriptions(self) -> dict[str, Subscription]:
         inputs = self._live.core.inputs.copy().items()
         return {topic: subscription for topic, subscription in inputs if isinstance(topic, str)}
+
+
+def _interpreter_options() -> list[str]:
+    """Return options that make an interpreter treat assertions and warnings as this one does."""
+    options = ["-O"] * sys.flags.optimize + ["-B"] * sys.flags.dont_write_bytecode
+    options += [f"-W{option}" for option in sys.warnoptions]
+    for name, value in sys._xoptions.items():
+        options += ["-X", name if value is True else f"{name}={value}"]
+    return options
 
 
 def _raise_first(done: messages.Done, failed: Exception | None) -> None:

@@ -9,6 +9,7 @@ import logging
 import os
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -794,6 +795,39 @@ def test_a_parent_that_is_killed_leaves_no_worker():
         assert set(os.listdir("/dev/shm")) <= before
     """)
     assert done.stderr == ""
+
+
+def test_the_worker_runs_with_the_interpreter_options_of_the_program(tmp_path):
+    """Assertions, warnings and development mode mean the same there."""
+    program = tmp_path / "robot.py"
+    program.write_text(
+        """
+import sys
+import horus
+from horus import Node
+
+def settings():
+    return sys.flags.optimize, sys.flags.dont_write_bytecode, sys.warnoptions, sys._xoptions
+
+def tell(node):
+    node.send("settings", list(map(str, settings())))
+
+def hear(node):
+    print(node.recv("settings") == list(map(str, settings())), *settings()[:2])
+    node.request_stop()
+
+horus.run(
+    Node("teller", tell, rate=20, compute="process", pubs=["settings"]),
+    Node("hearer", hear, on="settings"),
+    duration=20,
+)
+"""
+    )
+    options = ["-O", "-B", "-W", "error::ResourceWarning", "-X", "dev", "-X", "frozen_modules=off"]
+    done = subprocess.run(
+        [sys.executable, *options, program], capture_output=True, text=True, timeout=60
+    )
+    assert done.stdout.splitlines()[0] == "True 1 1", done.stderr
 
 
 @pytest.mark.parametrize("kind", ["None", "Plan"])

@@ -20,7 +20,7 @@ NOTHING_DUE = Mock(due_ns=Mock(return_value=None))
 @pytest.mark.parametrize(
     "executor",
     [
-        RtExecutor(Mock(), Mock()),
+        RtExecutor(Mock(), Mock(), Mock()),
         ThreadEventExecutor(Mock()),
         ComputeExecutor(Mock(), NOTHING_DUE, Mock()),
     ],
@@ -39,9 +39,12 @@ def test_the_baton_wakes_only_those_whose_turn_it_is():
     """A tracker at 100 Hz sleeps through nine of ten ticks of the safety monitor at 1 kHz."""
     control = RunControl(None, lambda live, lasted_ns: None)
     timeline = Timeline(SimClock(), 1000.0)
+    wake_loop = Mock()
     safety, tracker = (
         RtThread(
-            LiveNode(Node(name, lambda: None, rate=1000), timeline, control, place), Mock(spin_ns=0)
+            LiveNode(Node(name, lambda: None, rate=1000), timeline, control, place),
+            Mock(spin_ns=0),
+            wake_loop,
         )
         for place, name in enumerate(("safety", "tracker"))
     )
@@ -54,3 +57,11 @@ def test_the_baton_wakes_only_those_whose_turn_it_is():
     safety._pass_baton(10_000_000)
     assert tracker.park(0)
     assert not safety._waiting
+    wake_loop.assert_not_called()
+
+    safety.loop_waits_for_ns = 12_000_000
+    safety._pass_baton(11_000_000)
+    wake_loop.assert_not_called()
+    safety._pass_baton(12_000_000)
+    safety._pass_baton(13_000_000)
+    wake_loop.assert_called_once_with()
