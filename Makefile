@@ -32,6 +32,7 @@ docs: .venv/dev
 bench: .venv/dev
 	$(BIN)/python -m benchmarks micro --peers
 	$(BIN)/python -m benchmarks agv --peers --plot agv.bench.png
+	$(BIN)/python -m benchmarks service --peers
 
 clean:
 	rm -rf .venv .bench site .mypy_cache .pytest_cache .ruff_cache .hypothesis

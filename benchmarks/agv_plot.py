@@ -103,6 +103,15 @@ def draw_row(axes: Axes, latencies_us: Sequence[float], label: str) -> None:
     )
 
 
+def draw_absence(axes: Axes) -> None:
+    """Say that this contender did not run in this mode."""
+    axes.text(
+        0.5, 0.5, "not run", color=OTHER_COLOUR, transform=axes.transAxes, ha="center", size="small"
+    )
+    axes.spines["left"].set_visible(False)
+    axes.tick_params(which="both", left=False)
+
+
 def draw_target(column: Sequence[Axes], target: tuple[float, str]) -> None:
     """Mark a bound in all rows of a column and name it above the first."""
     bound_us, name = target
@@ -150,9 +159,16 @@ def draw(runs: Sequence[ChildRun], path: Path) -> None:
             latencies = latencies_of(runs, mode, label)
             if latencies:
                 draw_row(grid[row][number], latencies, label)
+            else:
+                draw_absence(grid[row][number])
         target = target_us(runs, mode)
         if target is not None:
-            draw_target([row[number] for row in grid], target)
+            rows = [
+                row[number]
+                for row, label in zip(grid, labels, strict=True)
+                if latencies_of(runs, mode, label)
+            ]
+            draw_target(rows, target)
         grid[0][number].set_title(MODES[mode].title, loc="left", pad=18.0)
         grid[-1][number].set_xlabel("start latency of the 1 kHz motor [µs]")
     figure.supylabel("ticks per bin [%]", fontsize="medium")

@@ -1,7 +1,8 @@
 """Measure what a worker process costs and what it takes to come back, and a scheduler in a service.
 
-A node with `compute="process"` answers messages, a worker crashes and is replaced, and an HTTP
-service answers requests without and with an idle scheduler on its event loop.
+A node with `compute="process"` answers messages, a worker crashes and is replaced, a planner
+computes in a thread and in a process beside a node of the event loop, and an HTTP service answers
+requests without and with an idle scheduler on its event loop.
 """
 
 from __future__ import annotations
@@ -61,6 +62,30 @@ def round_trip(title: str, series: str, target: Target) -> tuple[Measure, Measur
     return half, tail
 
 
+PLANNERS = {
+    "thread_python": "a planner in Python in a thread",
+    "thread_library": "a planner in a library in a thread",
+    "process_python": "a planner in Python in a process",
+}
+
+
+def beside(series: str, planner: str) -> tuple[Measure, Measure]:
+    """Return the lines about one planner, which computes for 40 ms ten times a second."""
+    late = Measure(
+        title=f"start of a 100 Hz node beside {planner}, p99",
+        unit="µs",
+        workload="planner",
+        statistic=percentile_of(f"{series}_late_us", 99.0),
+    )
+    tick = Measure(
+        title=f"40 ms of {planner}, p50",
+        unit="ms",
+        workload="planner",
+        statistic=median_of(f"{series}_tick_ms"),
+    )
+    return late, tick
+
+
 MEASURES = (
     *round_trip("3-float dict", "dict3_us", Target(bound=400.0)),
     *round_trip("480x640x3 uint8 image", "image_us", Target(bound=1500.0)),
@@ -71,6 +96,7 @@ MEASURES = (
         statistic=after_backoff,
         target=Target(bound=300.0),
     ),
+    *(line for series, planner in PLANNERS.items() for line in beside(series, planner)),
     Measure(
         title="HTTP requests, no scheduler inside",
         unit="1/s",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import hashlib
 import importlib
 import itertools
 import json
@@ -43,10 +44,12 @@ class Size:
     window_s: float
     settle_s: float
     """What passes before a window opens [s]."""
+    plans: int
+    """Ticks of each planner."""
 
 
-FULL = Size(round_trips=500, crashes=5, pairs=6, window_s=1.0, settle_s=0.3)
-QUICK = Size(round_trips=30, crashes=2, pairs=2, window_s=0.25, settle_s=0.1)
+FULL = Size(round_trips=500, crashes=5, pairs=6, window_s=1.0, settle_s=0.3, plans=30)
+QUICK = Size(round_trips=30, crashes=2, pairs=2, window_s=0.25, settle_s=0.1, plans=5)
 
 RATE_HZ = 100.0
 WARMUP_TRIPS = 20
@@ -240,6 +243,93 @@ def crash(horus: Any, size: Size) -> Series:
     return {"recovery_ms": [recover_ms(horus) for _ in range(size.crashes)]}
 
 
+PLANNING_S = 0.040
+"""CPU time of one tick of a planner [s]."""
+PLANNER_RATE_HZ = 10.0
+PLAN = "plan"
+CHUNK = bytes(1 << 20)
+
+
+def compute_in_python() -> None:
+    """Count cells; the interpreter is needed all the time."""
+    cells = 0
+    for cell in range(100):
+        cells += cell & 1
+
+
+def compute_in_library() -> None:
+    """Hash a megabyte in compiled code, which lets go of the interpreter meanwhile."""
+    hashlib.sha256(CHUNK)
+
+
+PLANNERS: Mapping[str, tuple[bool | str, Callable[[], None]]] = {
+    "thread_python": (True, compute_in_python),
+    "thread_library": (True, compute_in_library),
+    "process_python": ("process", compute_in_python),
+}
+"""Where a planner computes, and what."""
+
+
+def plan_beside(
+    horus: Any, compute: bool | str, work: Callable[[], None], size: Size
+) -> tuple[list[float], list[float]]:
+    """Run a planner beside a fast node of the event loop.
+
+    Returns how late the ticks of the fast one started after their release [µs], and how long
+    those of the planner took [ms].
+    """
+    release_of = importlib.import_module("horus.clock").current
+    late_us: list[float] = []
+    took_ms: list[float] = []
+
+    def follow(_node: Any) -> None:
+        started_ns = now_ns()
+        if took_ms:
+            late_us.append((started_ns - release_of.get().release_ns) / 1e3)
+
+    def plan(node: Any) -> None:
+        started_ns = now_ns()
+        # CPU time: a planner that is interrupted has as much left to do as before.
+        until_s = time.thread_time() + PLANNING_S
+        while time.thread_time() < until_s:
+            work()
+        node.send(PLAN, (now_ns() - started_ns) / 1e6)
+
+    def note(node: Any) -> None:
+        took_ms.extend(node.recv_all(PLAN))
+        # The first one opens the window.
+        if len(took_ms) > size.plans:
+            scheduler.stop()
+
+    scheduler = horus.Scheduler(tick_rate=1000.0)
+    scheduler.add(
+        horus.Node(
+            name="planner",
+            tick=plan,
+            rate=PLANNER_RATE_HZ,
+            order=0,
+            compute=compute,
+            pubs=[PLAN],
+        )
+    )
+    scheduler.add(horus.Node(name="tracker", tick=follow, rate=RATE_HZ, order=10))
+    scheduler.add(horus.Node(name="note", tick=note, on=PLAN, order=20, subs=[PLAN]))
+    limit_s = START_S + 2.0 * size.plans / PLANNER_RATE_HZ
+    scheduler.run(duration=limit_s)
+    if len(took_ms) <= size.plans:
+        raise RuntimeError(f"only {len(took_ms)} plans came within {limit_s:g} s")
+    return late_us, took_ms[1:]
+
+
+def planner(horus: Any, size: Size) -> Series:
+    """Measure planners in a thread and in a process, and a fast node beside them."""
+    series: Series = {}
+    for name, (compute, work) in PLANNERS.items():
+        late_us, took_ms = plan_beside(horus, compute, work, size)
+        series[f"{name}_late_us"], series[f"{name}_tick_ms"] = late_us, took_ms
+    return series
+
+
 HOST = "127.0.0.1"
 LOAD = Path(__file__).resolve().with_name("service_load.py")
 BODY = {"robot": "agv", "state": "driving", "x_m": 1.25, "y_m": -0.5}
@@ -344,7 +434,9 @@ class Contender(NamedTuple):
 
 
 CONTENDERS: Mapping[str, Contender] = {
-    "horus": Contender("horus", {"roundtrip": roundtrip, "crash": crash, "embed": embed}),
+    "horus": Contender(
+        "horus", {"roundtrip": roundtrip, "crash": crash, "planner": planner, "embed": embed}
+    ),
     "pool": Contender("concurrent.futures", {"roundtrip": roundtrip_pool}),
 }
 

@@ -33,6 +33,11 @@ def test_every_measure_belongs_to_a_workload_that_exists() -> None:
         assert set(wanted) == set(service_workloads.CONTENDERS[key].workloads)
 
 
+def test_every_planner_has_its_lines() -> None:
+    """What the workload runs and what the table names are the same."""
+    assert set(service.PLANNERS) == set(service_workloads.PLANNERS)
+
+
 def test_a_contender_fails_only_in_what_it_takes_part_in() -> None:
     """Elsewhere it has a dash, and this package has no such excuse."""
     runs = [ChildRun(round=1, workload="roundtrip", contender=service.POOL, error="crashed")]
