@@ -355,6 +355,8 @@ class RtExecutor(ThreadExecutor[RtThread]):
             thread.loop_waits_for_ns = min(thread.loop_waits_for_ns, release_ns)
             # Looked at again now that the thread can see us.
             if thread.done_ns < release_ns:
-                live.waited_until_ns = limit_ns
+                if not live.busy:  # the tick in progress, of an earlier release, waits for nobody
+                    live.waited_until_ns = limit_ns
                 return limit_ns
+        live.waited_until_ns = min(live.waited_until_ns, now_ns)
         return None

@@ -65,3 +65,33 @@ def test_the_baton_wakes_only_those_whose_turn_it_is():
     safety._pass_baton(12_000_000)
     safety._pass_baton(13_000_000)
     wake_loop.assert_called_once_with()
+
+
+def test_who_waits_for_an_rt_node_owes_its_tick_from_the_end_of_the_wait():
+    """Not from its latest start; and what it waits with says nothing about a tick in progress."""
+    clock = SimClock()
+    timeline = Timeline(clock, 1000.0)
+    control = RunControl(None, lambda live, lasted_ns: None)
+    motor, cloud = (
+        LiveNode(Node(name, lambda: None, rate=rate, order=order), timeline, control, order)
+        for order, (name, rate) in enumerate((("motor", 1000), ("cloud", 20)))
+    )
+    thread = RtThread(motor, Mock(spin_ns=0), Mock())
+    thread.engage(0)
+    executor = RtExecutor(Mock(), Mock(), Mock())
+    executor._in_order = [thread]
+    release_ns = 50_000_000
+
+    clock.advance_to(release_ns)
+    until_ns = executor._hold_up(cloud, release_ns, release_ns)
+    assert until_ns is not None
+    assert until_ns == cloud.owed_from_ns > release_ns
+
+    thread._pass_baton(release_ns)
+    assert executor._hold_up(cloud, release_ns, release_ns + 100) is None
+    assert cloud.owed_from_ns == release_ns + 100
+
+    cloud.tick_context.start_ns = release_ns + 100
+    cloud.tick_context.ticking = True
+    assert executor._hold_up(cloud, 2 * release_ns, 2 * release_ns) is not None
+    assert cloud.owed_from_ns == release_ns + 100
