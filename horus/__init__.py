@@ -13,6 +13,7 @@ from horus.errors import (
     HorusError,
     HorusWarning,
     NodeError,
+    RecordingError,
     ShutdownTimeout,
     StateError,
     TopicError,
@@ -28,6 +29,8 @@ from horus.stats import NodeTiming, TimingReport
 from horus.units import ms, us
 
 if TYPE_CHECKING:
+    from horus.recording.reader import RecordedMessage, RecordingReader
+    from horus.recording.recovery import Recovery, open_recording, recover
     from horus.scheduler import Scheduler, run
     from horus.stream import MessageStream
 
@@ -49,6 +52,10 @@ __all__ = [
     "NodeState",
     "NodeTiming",
     "Pub",
+    "RecordedMessage",
+    "RecordingError",
+    "RecordingReader",
+    "Recovery",
     "Scheduler",
     "ShutdownTimeout",
     "StateError",
@@ -65,6 +72,8 @@ __all__ = [
     "elapsed",
     "ms",
     "now",
+    "open_recording",
+    "recover",
     "rng_float",
     "run",
     "tick",
@@ -75,6 +84,11 @@ __all__ = [
 # program that only describes nodes does not wait for it.
 _LAZY = {
     "MessageStream": "horus.stream",
+    "RecordedMessage": "horus.recording.reader",
+    "RecordingReader": "horus.recording.reader",
+    "Recovery": "horus.recording.recovery",
+    "open_recording": "horus.recording.recovery",
+    "recover": "horus.recording.recovery",
     "Scheduler": "horus.scheduler",
     "run": "horus.scheduler",
 }

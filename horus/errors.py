@@ -54,6 +54,10 @@ class TopicError(HorusError, ValueError):
     """A message or a topic name was refused."""
 
 
+class RecordingError(HorusError, ValueError):
+    """A recording cannot be read, found, replayed or deleted; the message says what and where."""
+
+
 class NodeError(HorusError):
     """A node's callback failed and its failure policy is `fatal`.
 

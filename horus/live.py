@@ -8,6 +8,7 @@ import copy
 import inspect
 import logging
 import threading
+from collections.abc import Callable
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -63,6 +64,13 @@ class Limits(NamedTuple):
     """The deadline, or the timeout of a critical node if that is shorter."""
 
 
+NoteTick = Callable[[int, int, int, int, int, bool], None]
+"""Takes release, start, finish, excess over budget and past deadline [ns], and failure."""
+
+NoteChange = Callable[[str, str], None]
+"""Takes what has changed, and to what."""
+
+
 class Admission(Enum):
     """Whether a released node may tick."""
 
@@ -97,7 +105,11 @@ class LiveNode:
         self.timeline = timeline
         self.sequence = sequence
         self.counters = counters or NodeCounters()
-        self.state = NodeState.UNINITIALIZED
+        self._state = NodeState.UNINITIALIZED
+        self.note_tick: NoteTick | None = None
+        """Takes note of every tick, if anybody wants to know."""
+        self.note_change: NoteChange | None = None
+        """Takes note of changes of state and health, if anybody wants to know."""
         self.trigger: Subscription | None = None
         self.publishes = frozenset(pub.topic for pub in core.pubs)
         self.subscribes = frozenset(sub.topic for sub in core.subs)
@@ -123,7 +135,7 @@ class LiveNode:
         self.reports = NodeReports(core.log, self.tick_context)
         self.callbacks = core.callbacks
         has_hook = core.callbacks["safe_state"] is not None
-        self.standing = Standing(self.counters, self._close_gate, has_hook=has_hook)
+        self.standing = Standing(self.counters, self._close_gate, self._changed, has_hook=has_hook)
         self._claims = threading.Lock()
         self._restart_at_ns = 0
         self._freed_ns = clock.NEVER
@@ -136,6 +148,17 @@ class LiveNode:
     def name(self) -> str:
         """The node's name."""
         return self.spec.name
+
+    @property
+    def state(self) -> NodeState:
+        """Where the node is in its life."""
+        return self._state
+
+    @state.setter
+    def state(self, state: NodeState) -> None:
+        if state is not self._state:
+            self._state = state
+            self._changed("state", state)
 
     @property
     def order(self) -> int:
@@ -481,6 +504,10 @@ class LiveNode:
 
     def _close_gate(self) -> None:
         self.gated = True
+
+    def _changed(self, what: str, value: str) -> None:
+        if self.note_change is not None:
+            self.note_change(what, value)
 
 
 class _Nobody:

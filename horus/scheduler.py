@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from horus import embedding, unavailable
 from horus.core import NodeCore, core_of
@@ -23,6 +24,9 @@ from horus.stream import MessageStream
 from horus.topics import Publisher
 from horus.units import to_s
 from horus.validation import check_count, check_duration, check_topic, optional_duration
+
+if TYPE_CHECKING:
+    from horus.recording.sessions import RecordedSession
 
 _APPLICATION = "application"
 
@@ -42,7 +46,8 @@ class Scheduler:
         deterministic: bool = False,
         blackbox_mb: int = 0,
         watchdog_ms: int = 0,
-        recording: bool = False,
+        recording: bool | str | os.PathLike[str] = False,
+        recording_backpressure: str = "drop",
         name: str | None = None,
         cores: Iterable[int] | None = None,
         max_deadline_misses: int | None = None,
@@ -64,7 +69,10 @@ class Scheduler:
             blackbox_mb: Size of the flight recorder [MB]; 0 for none. Not in this version.
             watchdog_ms: Timeout after which a tick counts as frozen [ms]; 0 for never.
                 See `add_critical_node` and `Node(watchdog=)`.
-            recording: Record the session. Not in this version.
+            recording: Record every session: True, or the directory where its files go.
+                Without one, `HORUS_HOME`/recordings or the user's data directory.
+            recording_backpressure: What happens to what is recorded faster than it can be
+                written: `"drop"` loses and counts it, with `"block"` BestEffort nodes wait.
             name: For logs and reports; `"horus"` when not given.
             cores: CPU cores to run on.
             max_deadline_misses: Stop after this many misses in all; None for no limit.
@@ -88,6 +96,7 @@ class Scheduler:
             blackbox_mb=blackbox_mb,
             watchdog_ms=watchdog_ms,
             recording=recording,
+            recording_backpressure=recording_backpressure,
             name=name,
             cores=cores,
             max_deadline_misses=max_deadline_misses,
@@ -495,35 +504,45 @@ class Scheduler:
         """Return what was requested and refused, in readable sentences."""
         return self._session.oversight.real_time.degradations()
 
-    # -- recording: the contract's names, refused until there is something behind them --
+    # -- recording -------------------------------------------------------------------
 
     def is_recording(self) -> bool:
-        """Return whether the session is being recorded."""
-        return False
+        """Return whether what happens is being recorded."""
+        return self._session.recording
 
-    def stop_recording(self) -> list[str]:
-        """Raise: this version does not record.
+    def stop_recording(self) -> list[Path]:
+        """Record no more of this run; return its files.
 
-        Raises:
-            StateError: Always.
+        After a run, the files of that run; without `recording=`, none.
         """
-        unavailable.refuse_recording("recording to stop")
+        return self._session.stop_recording()
 
-    def list_recordings(self) -> list[str]:
-        """Raise: this version does not record.
+    def list_recordings(self) -> list[RecordedSession]:
+        """Return the names of all recorded sessions, the oldest first.
 
-        Raises:
-            StateError: Always.
+        Also those of other programs, and those that have no end because their process
+        died: each is a `str` with `path`, and a `state` of `"finished"`, `"recording"`
+        or `"unfinished"`.
         """
-        unavailable.refuse_recording("session to list")
+        from horus.recording import sessions
+
+        return sessions.sessions(self._recordings_directory())
 
     def delete_recording(self, name: str) -> None:
-        """Raise: this version does not record.
+        """Delete a recorded session.
 
         Raises:
-            StateError: Always.
+            RecordingError: It is no name of a session, there is no such session, or it is
+                being recorded.
         """
-        unavailable.refuse_recording(f"session {name!r} to delete")
+        from horus.recording import sessions
+
+        sessions.delete(name, self._recordings_directory())
+
+    def _recordings_directory(self) -> Path:
+        from horus.recording import sessions
+
+        return self._spec.recording_directory or sessions.default_directory()
 
     # -- internals -------------------------------------------------------------------
 

@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from horus import clock, logs
 from horus.clock import MonotonicClock, SimClock, Timeline
@@ -24,6 +26,9 @@ from horus.spec import SchedulerSpec
 from horus.stream import MessageStream
 from horus.topics import Bus, Subscription
 from horus.units import to_s
+
+if TYPE_CHECKING:
+    from horus.recording.recordings import Recordings
 
 
 class Session:
@@ -72,6 +77,7 @@ class Session:
         self._driving_thread: int | None = None
         self._loop: StepLoop | None = None
         self._streams: set[MessageStream] = set()
+        self._recordings = self._make_recordings()
 
     @property
     def running(self) -> bool:
@@ -177,11 +183,31 @@ class Session:
         if failure is not None:
             raise failure
 
+    # -- recording -----------------------------------------------------------------------
+
+    @property
+    def recording(self) -> bool:
+        """Whether what happens is being recorded."""
+        return self._recordings is not None and self._recordings.active
+
+    def stop_recording(self) -> list[Path]:
+        """Record no more of this session; return its files, or those of the last one."""
+        return [] if self._recordings is None else self._recordings.stop()
+
+    def _make_recordings(self) -> Recordings | None:
+        if not self._spec.recording:
+            return None
+        from horus.recording.recordings import Recordings  # it loads several libraries
+
+        return Recordings(self._spec, self.timeline, self.bus)
+
     # -- nodes that come, change and go ------------------------------------------------
 
     def joined(self, live: LiveNode) -> None:
         """Let a node that was added take part: now, or from the next run or step on."""
         self.oversight.watch(live)
+        if self._recordings is not None:
+            self._recordings.join(live)
         runtime, stepper = self._drivers.runtime, self._drivers.stepper
         if self.running and runtime is not None:
             runtime.add(live)
@@ -190,6 +216,8 @@ class Session:
 
     def retimed(self, live: LiveNode) -> None:
         """Adopt a node's changed rate."""
+        if self._recordings is not None:
+            self._recordings.describe(live)
         for driver in (self._drivers.runtime, self._drivers.stepper):
             if driver is not None:
                 driver.retime(live)
@@ -261,6 +289,8 @@ class Session:
             self._open = True
             self.oversight.safety.reset()
             self.registry.renew()
+            if self._recordings is not None:
+                self._recordings.begin(self.registry.in_order)
 
     def _hand_back(self, *, keeps_open: bool) -> None:
         """Let others run the nodes; unless they stay initialised, they are shut down."""
@@ -296,6 +326,8 @@ class Session:
                 live.counters.end_span(live.period_ns)
             for stream in tuple(self._streams):
                 stream.close()
+            if self._recordings is not None:
+                self._recordings.stop()
             clock.clear_ambient(self.timeline)
 
     def _all(self) -> tuple[LiveNode, ...]:
@@ -329,6 +361,8 @@ class Session:
             stepper = self._drivers.stepper = self._make_stepper()
         if stepper.take_on(self.registry.in_order):
             self.oversight.look_again()
+            if self._recordings is not None:
+                self._recordings.run_begins()
         return stepper
 
     def _make_stepper(self) -> Stepper:
@@ -339,6 +373,8 @@ class Session:
         return Simulation(self.timeline, self._sim_clock, self._stopping, safety, inspector)
 
     def _ready(self) -> None:
+        if self._recordings is not None:
+            self._recordings.run_begins()
         if not self.control.stopping:
             self.started = True
             self.runs_started += 1

@@ -276,18 +276,18 @@ def _freeze_struct(frozen_type: bool, value: Any, depth: int) -> Frozen:
     changed, thaws = _freeze_fields(fields, depth)
     if frozen_type and not changed:
         return value, None
-    return _with_fields(copy.copy(value), changed), functools.partial(
+    return with_fields(copy.copy(value), changed), functools.partial(
         _thaw_fields, copy.copy, tuple(thaws)
     )
 
 
 def _freeze_instance(slots: tuple[str, ...], frozen_type: bool, value: Any, depth: int) -> Frozen:
-    fields = _attributes(slots, value)
+    fields = attributes(slots, value)
     changed, thaws = _freeze_fields(fields, depth)
     if frozen_type and not changed:
         return value, None
     duplicate = functools.partial(_copy_instance, slots)
-    return _with_fields(duplicate(value), changed), functools.partial(
+    return with_fields(duplicate(value), changed), functools.partial(
         _thaw_fields, duplicate, tuple(thaws)
     )
 
@@ -314,10 +314,11 @@ def _thaw_fields(
     duplicate: Callable[[Any], Any], thaws: tuple[tuple[str, Any], ...], payload: Any
 ) -> Any:
     fresh = duplicate(payload)
-    return _with_fields(fresh, [(name, thaw(getattr(fresh, name))) for name, thaw in thaws])
+    return with_fields(fresh, [(name, thaw(getattr(fresh, name))) for name, thaw in thaws])
 
 
-def _with_fields(instance: Any, fields: list[tuple[str, Any]]) -> Any:
+def with_fields(instance: Any, fields: list[tuple[str, Any]]) -> Any:
+    """Set fields of an instance, and return it."""
     # Past the class's own __setattr__: frozen classes and validators refuse.
     if isinstance(instance, msgspec.Struct):
         for name, item in fields:
@@ -336,10 +337,10 @@ def _copy_instance(slots: tuple[str, ...], value: Any) -> Any:
     fresh = object.__new__(type(value))
     if hasattr(value, "__dict__"):
         fresh.__dict__.update(value.__dict__)
-    return _with_fields(fresh, _held_in_slots(slots, value))
+    return with_fields(fresh, _held_in_slots(slots, value))
 
 
-def _attributes(slots: tuple[str, ...], value: Any) -> list[tuple[str, Any]]:
+def attributes(slots: tuple[str, ...], value: Any) -> list[tuple[str, Any]]:
     """Return all that an instance holds, declared as a field or not."""
     return [*getattr(value, "__dict__", {}).items(), *_held_in_slots(slots, value)]
 
@@ -348,7 +349,7 @@ def _held_in_slots(slots: tuple[str, ...], value: Any) -> list[tuple[str, Any]]:
     return [(name, getattr(value, name)) for name in slots if hasattr(value, name)]
 
 
-def _slots_of(kind: type) -> tuple[str, ...]:
+def slots_of(kind: type) -> tuple[str, ...]:
     """Return the names of all slots of a class and its bases, as attributes."""
     return tuple(
         _mangled(base, name)
@@ -426,13 +427,13 @@ def _choose(kind: type) -> Freezer:
         return _freeze_tuple
     if issubclass(kind, msgspec.Struct):
         return functools.partial(_freeze_struct, bool(kind.__struct_config__.frozen))
-    if dataclasses.is_dataclass(kind) and _is_plain(kind):
+    if dataclasses.is_dataclass(kind) and is_plain(kind):
         frozen = bool(kind.__dataclass_params__.frozen)  # type: ignore[attr-defined]
-        return functools.partial(_freeze_instance, _slots_of(kind), frozen)
+        return functools.partial(_freeze_instance, slots_of(kind), frozen)
     return _freeze_deep
 
 
-def _is_plain(kind: type) -> bool:
+def is_plain(kind: type) -> bool:
     """Return whether an instance is nothing but its attributes."""
     hooks = ("__new__", "__reduce__", "__reduce_ex__", "__copy__", "__deepcopy__")
     return all(getattr(kind, hook, None) is getattr(object, hook, None) for hook in hooks)

@@ -6,8 +6,10 @@ everything below works on the integers.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from pathlib import Path
 
 from horus.errors import ConfigError, ConfigWarning, warn_user
 from horus.timing import period_ns
@@ -272,6 +274,10 @@ class SchedulerSpec:
     blackbox_mb: int
     watchdog_ns: int
     recording: bool
+    recording_directory: Path | None
+    """Where recordings go; None for the default."""
+    recording_blocks: bool
+    """Whether BestEffort nodes wait for a recording that does not keep up."""
     cores: tuple[int, ...] | None
     max_deadline_misses: int | None
     verbose: bool
@@ -290,6 +296,7 @@ def make_scheduler_spec(
     blackbox_mb: object,
     watchdog_ms: object,
     recording: object,
+    recording_backpressure: object,
     name: object,
     cores: object,
     max_deadline_misses: object,
@@ -309,6 +316,11 @@ def make_scheduler_spec(
         raise ConfigError("loop", loop, "must be 'uvloop' or 'asyncio'")
     if telemetry is not None and (not isinstance(telemetry, str) or not telemetry):
         raise ConfigError("telemetry", telemetry, "must be an endpoint URL")
+    if recording_backpressure not in ("drop", "block"):
+        raise ConfigError(
+            "recording_backpressure", recording_backpressure, "must be 'drop' or 'block'"
+        )
+    directory = _directory(recording)
     return SchedulerSpec(
         name="horus" if name is None else check_name("name", name),
         tick_rate_hz=check_rate(tick_rate, "tick_rate"),
@@ -316,7 +328,9 @@ def make_scheduler_spec(
         deterministic=check_flag("deterministic", deterministic),
         blackbox_mb=check_count("blackbox_mb", blackbox_mb),
         watchdog_ns=check_count("watchdog_ms", watchdog_ms) * NS_PER_MS,
-        recording=check_flag("recording", recording),
+        recording=bool(recording),
+        recording_directory=directory,
+        recording_blocks=recording_backpressure == "block",
         cores=check_cores(cores),
         max_deadline_misses=None
         if max_deadline_misses is None
@@ -328,6 +342,16 @@ def make_scheduler_spec(
         spin_ns=_spin_ns(spin_us, rt),
         seed=check_count("seed", seed),
     )
+
+
+def _directory(recording: object) -> Path | None:
+    """Return the directory that `recording=` names; None if it is True or False."""
+    if isinstance(recording, bool):
+        return None
+    text = os.fspath(recording) if isinstance(recording, str | os.PathLike) else None
+    if not isinstance(text, str) or not text or "\0" in text:
+        raise ConfigError("recording", recording, "must be True, False or a directory")
+    return Path(text).expanduser()
 
 
 def _spin_ns(spin_us: object, rt: object) -> int:

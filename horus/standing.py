@@ -17,10 +17,23 @@ class Standing:
     """
 
     def __init__(
-        self, counters: NodeCounters, close_gate: Callable[[], None], *, has_hook: bool
+        self,
+        counters: NodeCounters,
+        close_gate: Callable[[], None],
+        changed: Callable[[str, str], None],
+        *,
+        has_hook: bool,
     ) -> None:
-        """Begin healthy and free; `close_gate` keeps the node from ticking unasked."""
-        self.health = Health.HEALTHY
+        """Begin healthy and free.
+
+        Args:
+            counters: The node's.
+            close_gate: Keeps the node from ticking unasked.
+            changed: Told of each change: what, and to what.
+            has_hook: Whether there is a safe-state hook.
+        """
+        self._health = Health.HEALTHY
+        self._changed = changed
         self.held = False
         """Whether the node is kept from ticking until the safe state is cleared."""
         self.holds = 0
@@ -36,9 +49,18 @@ class Standing:
         self._close_gate = close_gate
         self._lock = threading.Lock()
 
+    @property
+    def health(self) -> Health:
+        """What supervision thinks of the node."""
+        return self._health
+
+    def _become(self, health: Health) -> None:
+        self._health = health
+        self._changed("health", health)
+
     def renew(self) -> None:
         """Begin again, healthy and free: a new run begins."""
-        self.health = Health.HEALTHY
+        self._health = Health.HEALTHY
         self.held = self.alert = False
         self.hook_returned.set()
 
@@ -55,7 +77,7 @@ class Standing:
     def _expire(self, health: Health) -> None:
         if self.health is Health.HEALTHY:
             self._counters.watchdog_expirations += 1
-        self.health = health
+        self._become(health)
         self.alert = True
 
     def expired_unseen(self) -> None:
@@ -76,7 +98,7 @@ class Standing:
         with self._lock:
             if self.health in (Health.HEALTHY, Health.ISOLATED):
                 return False
-            self.health = Health.HEALTHY
+            self._become(Health.HEALTHY)
         return True
 
     def isolate(self, ticks: int) -> bool:
@@ -113,6 +135,7 @@ class Standing:
         self.held = True
         self._close_gate()
         self.holds += 1
+        self._changed("held", "yes")
 
     def let_go(self) -> None:
         """Hold and isolate the node no more.
@@ -122,9 +145,11 @@ class Standing:
         Thread: any.
         """
         with self._lock:
-            self.held = False
+            if self.held:
+                self.held = False
+                self._changed("held", "no")
             if self.health is Health.ISOLATED:
-                self.health = Health.HEALTHY
+                self._become(Health.HEALTHY)
 
     def claim_hook(self) -> bool:
         """Return whether there is a safe-state hook to call; who hears yes must call it.

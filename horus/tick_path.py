@@ -6,7 +6,7 @@ twin. Both do, in this order:
 1. admit: a node that is restarting, skipping or leaving does not tick;
 2. enter the tick context, so that `horus.now()` and `horus.dt()` answer;
 3. call the user's function, holding on to whatever it raises;
-4. count: ticks, execution time, start latency;
+4. count: ticks, execution time, start latency; have the tick recorded, if anything does;
 5. decide (`escalation.decide`, pure) and act, if anything is out of order.
 
 No lock is taken and nothing is logged unless something is wrong.
@@ -121,6 +121,7 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException |
     counters = live.counters
     add_times = counters.times.add
     standing = live.standing
+    note_tick = live.note_tick
 
     def finish(release_ns: int, start_ns: int, limits: Limits, error: BaseException | None) -> bool:
         finish_ns = now_ns()
@@ -140,6 +141,8 @@ def _build_finish(live: LiveNode) -> Callable[[int, int, Limits, BaseException |
             return _settle(live, release_ns, finish_ns, limits, over_budget_ns, error)
         context.finish_ns = finish_ns
         context.ticking = False
+        if note_tick is not None:
+            note_tick(release_ns, start_ns, finish_ns, 0, 0, False)
         return False
 
     return finish
@@ -178,6 +181,15 @@ def _settle(
         failure_policy=live.spec.failure_policy,
         in_episode=live.in_episode,
     )
+    if live.note_tick is not None:
+        live.note_tick(
+            release_ns,
+            context.start_ns,
+            finish_ns,
+            outcome.over_budget_ns,
+            outcome.past_deadline_ns,
+            outcome.failed,
+        )
     standing = live.standing
     live.in_episode = standing.alert = outcome.missed
     if error is not None:

@@ -22,16 +22,6 @@ from horus.validation import check_topic
 _log = logging.getLogger("horus.topics")
 
 
-class Sent(NamedTuple):
-    """What a tap on the bus sees of a message."""
-
-    topic: str
-    publisher: str
-    sequence: int
-    message: Any
-    """The frozen message: to be read, never changed."""
-
-
 class TopicStatistics(NamedTuple):
     """Counters of one topic since it was created."""
 
@@ -42,7 +32,7 @@ class TopicStatistics(NamedTuple):
     subscribers: tuple[str, ...]
 
 
-Tap = Callable[[Sent], None]
+Tap = Callable[["Publisher", Frozen], None]
 """Called for every message sent, on the sender's thread: must be quick and never raise."""
 
 
@@ -207,9 +197,8 @@ class Publisher:
             if subscription.wake is not None:
                 subscription.wake()
         if topic.taps:
-            sent = Sent(topic.name, self.owner, self.sent, frozen[0])
             for tap in topic.taps:
-                tap(sent)
+                tap(self, frozen)
 
     def close(self) -> None:
         """Take the sender away from the topic; what it sent stays counted."""

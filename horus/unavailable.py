@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NoReturn
-
-from horus.errors import StateError, UnavailableWarning, warn_user
+from horus.errors import UnavailableWarning, warn_user
 from horus.spec import SchedulerSpec
 
 
@@ -12,7 +10,6 @@ def warn_of_scheduler(spec: SchedulerSpec) -> None:
     """Warn of the arguments of a scheduler that have no effect."""
     for asked, argument, consequence in (
         (spec.blackbox_mb, "blackbox_mb=", "there is no flight recorder"),
-        (spec.recording, "recording=True", "nothing is recorded"),
         (spec.telemetry, "telemetry=", "no metrics are sent"),
     ):
         if asked:
@@ -22,12 +19,3 @@ def warn_of_scheduler(spec: SchedulerSpec) -> None:
 def warn(feature: str, consequence: str) -> None:
     """Warn that a feature has no effect."""
     warn_user(f"{feature} is not part of this version: {consequence}", UnavailableWarning)
-
-
-def refuse_recording(what: str) -> NoReturn:
-    """Raise because nothing is ever recorded.
-
-    Raises:
-        StateError: Always.
-    """
-    raise StateError(f"recording is not part of this version; there is no {what}")

@@ -221,7 +221,7 @@ def test_a_tick_rate_must_be_a_finite_number_of_hz_above_zero(tick_rate):
     assert_refused(refused, "tick_rate", tick_rate, "Hz")
 
 
-@pytest.mark.parametrize("flag", ["rt", "deterministic", "recording", "verbose"])
+@pytest.mark.parametrize("flag", ["rt", "deterministic", "verbose"])
 @pytest.mark.parametrize("value", [1, "yes", None])
 def test_flags_must_be_true_or_false(flag, value):
     """Flags that are neither True nor False are refused."""

@@ -1,0 +1,1 @@
+"""Recording, replay and the flight recorder: what happened, kept."""

@@ -1,0 +1,163 @@
+"""Salvages recordings that have no end, because their process died or the disk was full."""
+
+from __future__ import annotations
+
+import logging
+import os
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Schema
+
+from horus.errors import RecordingError
+from horus.recording import mcap_file, reader, sessions
+from horus.recording.reader import Record, RecordingReader
+
+_log = logging.getLogger("horus.recording")
+
+_IGNORED_OPCODE = 0x80
+"""Of private records, which every reader of MCAP skips."""
+_CHANNEL = struct.Struct("<H")
+
+
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """What was salvaged."""
+
+    path: Path
+    """The recording, which is finished now."""
+    messages: int
+    """How many messages of all channels it has, ticks and log records included."""
+    bytes_dropped: int
+    """How many bytes at the end, and in damaged chunks, could not be used."""
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        dropped = f"; {self.bytes_dropped} bytes were not usable" if self.bytes_dropped else ""
+        return f"{self.path}: {self.messages} messages{dropped}"
+
+
+def recover(path: str | os.PathLike[str]) -> Recovery:
+    """Give a recording the end that it lacks; one that has an end is left as it is.
+
+    In place: what is incomplete at the end is cut off, chunks that are damaged are marked so
+    that readers skip them, and the index is written. Should that be interrupted, it can be
+    done again.
+
+    Raises:
+        RecordingError: It is no recording, there is nothing to salvage, it is being recorded,
+            or it cannot be written.
+    """
+    where = Path(path)
+    try:
+        descriptor = os.open(where, os.O_RDWR | os.O_CLOEXEC)
+    except OSError as exc:
+        raise RecordingError(f"{where} cannot be recovered: {exc}") from exc
+    try:
+        if not sessions.lock(descriptor):
+            raise RecordingError(f"{where} is being recorded; stop that first")
+        return _recover(where, descriptor)
+    except OSError as exc:
+        raise RecordingError(f"{where} cannot be recovered: {exc}") from exc
+    finally:
+        os.close(descriptor)
+
+
+def open_recording(path: str | os.PathLike[str]) -> RecordingReader:
+    """Open a recording to read it; recover it first if its process has died.
+
+    Raises:
+        RecordingError: It is no recording, it is being recorded, or it cannot be recovered.
+    """
+    if sessions.state_of(Path(path)) == "unfinished":
+        _log.warning("recovered %s", recover(path))
+    return RecordingReader(path)
+
+
+def _recover(path: Path, descriptor: int) -> Recovery:
+    with reader.open_file(path) as file:
+        size = os.fstat(descriptor).st_size
+        found = _survey(file)
+    finished = sessions.state_of(path) == "finished"
+    if finished and not found.damaged:
+        return Recovery(path, found.summary.counts.total(), 0)
+    for record in found.damaged:
+        os.pwrite(descriptor, bytes([_IGNORED_OPCODE]), record.offset)
+    os.ftruncate(descriptor, found.end)
+    output = mcap_file.AppendedFile(descriptor)
+    if found.unindexed is not None:
+        mcap_file.append_index(output, found.summary, *found.unindexed)
+    output.append(found.summary.end(output.size))
+    output.sync()
+    dropped = sum(record.end - record.offset for record in found.damaged)
+    if not finished:
+        dropped += size - found.end
+    return Recovery(path, found.summary.counts.total(), dropped)
+
+
+@dataclass(slots=True)
+class _Survey:
+    """What is in a file, whether it has an end or not."""
+
+    summary: mcap_file.Summary
+    end: int = 0
+    """Where what can be used ends."""
+    damaged: list[Record] = field(default_factory=list)
+    """Chunks that cannot be read."""
+    unindexed: tuple[ChunkIndex, mcap_file.Index] | None = None
+    """The last chunk, if its index is cut short."""
+
+
+def _survey(file: BinaryIO) -> _Survey:
+    found = _Survey(mcap_file.Summary())
+    chunk: tuple[ChunkIndex, mcap_file.Index] | None = None
+    for record in reader.records(file):
+        if record.opcode == Opcode.CHUNK:
+            if chunk is not None:
+                found.summary.add_chunk(*chunk)
+            chunk = _survey_chunk(found, record)
+        elif record.opcode == Opcode.MESSAGE_INDEX and chunk is not None:
+            entry, _ = chunk
+            (channel,) = _CHANNEL.unpack_from(record.content)
+            entry.message_index_offsets[channel] = record.offset
+            entry.message_index_length += record.end - record.offset
+        elif record.opcode not in (Opcode.HEADER, Opcode.MESSAGE_INDEX, _IGNORED_OPCODE):
+            break  # the end begins
+        found.end = record.end
+    if chunk is not None:
+        entry, index = chunk
+        if entry.message_index_offsets.keys() == index.keys():
+            found.summary.add_chunk(entry, index)
+        else:
+            found.unindexed = chunk
+            found.end = entry.chunk_start_offset + entry.chunk_length
+    return found
+
+
+def _survey_chunk(found: _Survey, record: Record) -> tuple[ChunkIndex, mcap_file.Index] | None:
+    """Return what the summary says of a chunk, and its index; None if it cannot be read."""
+    index: mcap_file.Index = {}
+    definitions: list[Schema | Channel] = []
+    try:
+        head, data = reader.unpack(record.content)
+        view = memoryview(data)
+        for opcode, start, end in reader.walk(data):
+            if opcode == Opcode.MESSAGE:
+                _, _, channel, _, log_ns, _ = reader.head_of_message(data, start)
+                index.setdefault(channel, []).extend((log_ns, start))
+            elif opcode == Opcode.SCHEMA:
+                definitions.append(reader.definition(Schema, view[start:end]))
+            elif opcode == Opcode.CHANNEL:
+                definitions.append(reader.definition(Channel, view[start:end]))
+    except ValueError:
+        found.damaged.append(record)
+        return None
+    if index.keys() != {it.id for it in definitions if isinstance(it, Channel)}:
+        found.damaged.append(record)
+        return None
+    for definition in definitions:
+        found.summary.define(definition)
+    return mcap_file.chunk_index(head, record.offset, record.end - record.offset), index
