@@ -230,16 +230,17 @@ class Run:
     outcome: mission.Outcome
     timing: str
     stop_reason: str | None
+    recordings: list[Path]
 
 
-def drive_mission(*, deterministic: bool, duration_s: float) -> Run:
+def drive_mission(*, deterministic: bool, duration_s: float, recording: bool | Path = False) -> Run:
     """Build the vehicle, run it until it has arrived, and judge what happened."""
     world, grid = World(), OccupancyGrid()
     log = mission.MissionLog(clock=lambda: world.snapshot.time_s)
     options = {"tick_rate": 1000, "watchdog_ms": 500, "name": "warehouse_agv"}
     with (
         FleetServer() as server,
-        Scheduler(deterministic=deterministic, **options) as sched,
+        Scheduler(deterministic=deterministic, recording=recording, **options) as sched,
     ):
         sched.add(SafetyMonitor(log))
         sched.add(LidarNode("front", 10, world, log)).add(LidarNode("rear", 11, world, log))
@@ -251,6 +252,7 @@ def drive_mission(*, deterministic: bool, duration_s: float) -> Run:
         sched.add_critical_node("safety", timeout_ms=100)
         sched.run(duration=duration_s)
         timing, stop_reason = str(sched.timing_report()), sched.stop_reason
+        recordings = sched.stop_recording()
     return Run(
         world=world,
         grid=grid,
@@ -258,6 +260,7 @@ def drive_mission(*, deterministic: bool, duration_s: float) -> Run:
         outcome=mission.judge(log, world.record, world.pose()),
         timing=timing,
         stop_reason=stop_reason,
+        recordings=recordings,
     )
 
 

@@ -29,6 +29,7 @@ from horus.stats import NodeTiming, TimingReport
 from horus.units import ms, us
 
 if TYPE_CHECKING:
+    from horus.recording.diff import Divergence, diff
     from horus.recording.reader import RecordedMessage, RecordingReader
     from horus.recording.recovery import Recovery, open_recording, recover
     from horus.scheduler import Scheduler, run
@@ -40,6 +41,7 @@ __all__ = [
     "CallbackInterrupted",
     "ConfigError",
     "ConfigWarning",
+    "Divergence",
     "ExecutionClass",
     "FailurePolicy",
     "Health",
@@ -68,6 +70,7 @@ __all__ = [
     "WorkerError",
     "__version__",
     "budget_remaining",
+    "diff",
     "dt",
     "elapsed",
     "ms",
@@ -83,6 +86,8 @@ __all__ = [
 # These bring in asyncio, which takes longer to import than all the rest: a
 # program that only describes nodes does not wait for it.
 _LAZY = {
+    "Divergence": "horus.recording.diff",
+    "diff": "horus.recording.diff",
     "MessageStream": "horus.stream",
     "RecordedMessage": "horus.recording.reader",
     "RecordingReader": "horus.recording.reader",

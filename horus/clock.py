@@ -17,6 +17,7 @@ from contextvars import ContextVar
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from horus.stats import NodeCounters
+from horus.timing import FOREVER_NS as FOREVER_NS
 from horus.timing import ReleaseGrid
 from horus.units import NS_PER_S, to_s
 
@@ -31,9 +32,6 @@ process_time_ns: Callable[[], int] = time.process_time_ns
 
 wall_ns: Callable[[], int] = time.time_ns
 """Wall clock [ns since 1970]: for stamping what people read, never for scheduling."""
-
-FOREVER_NS = 1 << 63
-"""An instant [ns] that does not come."""
 
 NEVER = -1
 """In place of an instant [ns] that has not come yet."""
@@ -165,6 +163,10 @@ class Timeline:
         self._first_cycle = self.current_cycle()
         self._paused_at = None
         self.grid = ReleaseGrid(epoch_ns, self.tick_rate_hz)
+
+    def count_from(self, cycle: int) -> None:
+        """Let the first cycle have this number; nothing runs yet."""
+        self._paused_at = cycle
 
     def pause(self) -> None:
         """End the present cycle and count no more: nothing runs."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from horus.callables import Callback, is_async_callable, takes_node
@@ -36,6 +36,8 @@ class NodeCore:
         self.spec = spec
         self.pubs = pubs
         self.subs = subs
+        self.publishes = frozenset(pub.topic for pub in pubs)
+        self.subscribes = frozenset(sub.topic for sub in subs)
         self.is_async = is_async_callable(functions["tick"])
         self.functions = functions
         self.on_error: Callable[[Any, BaseException], None] | None = functions["on_error"]
@@ -43,6 +45,8 @@ class NodeCore:
             phase: _without_arguments(functions[phase], node)
             for phase in ("init", "tick", "shutdown", "safe_state")
         }
+        self.releases_ns: Sequence[int] | None = None
+        """Release instants after the epoch [ns] in place of a rate: what is recorded has them."""
         self.log = logging.getLogger(f"horus.node.{spec.name}")
         self.owner: object | None = None
         self.request_stop: Callable[[str], None] | None = None

@@ -20,7 +20,7 @@ from horus.reports import NodeReports
 from horus.spec import ExecutionClass, Health, NodeSpec, NodeState
 from horus.standing import Standing
 from horus.stats import NodeCounters
-from horus.timing import ReleaseGrid
+from horus.timing import Grid, ReleaseGrid, ReleaseTimes
 from horus.units import NS_PER_MS, NS_PER_S, readable
 
 if TYPE_CHECKING:
@@ -111,8 +111,7 @@ class LiveNode:
         self.note_change: NoteChange | None = None
         """Takes note of changes of state and health, if anybody wants to know."""
         self.trigger: Subscription | None = None
-        self.publishes = frozenset(pub.topic for pub in core.pubs)
-        self.subscribes = frozenset(sub.topic for sub in core.subs)
+        self.publishes, self.subscribes = core.publishes, core.subscribes
         self.tick_context = TickContext(core.spec.name, timeline, self.counters)
         self.context = contextvars.copy_context()
         self.context.run(clock.current.set, self.tick_context)
@@ -226,8 +225,10 @@ class LiveNode:
         self.critical_ns = timeout_ns
         self.apply(self.spec)
 
-    def grid(self) -> ReleaseGrid:
+    def grid(self) -> Grid:
         """Return the node's release grid: every node counts from the same epoch."""
+        if self.core.releases_ns is not None:
+            return ReleaseTimes(self.timeline.epoch_ns, self.core.releases_ns)
         return ReleaseGrid(self.timeline.epoch_ns, self.spec.rate_hz)
 
     # -- callbacks ---------------------------------------------------------------

@@ -31,8 +31,8 @@ class Registry:
         self._added = 0
         self.in_order: tuple[LiveNode, ...] = ()
 
-    def add(self, node: Node, control: Control) -> LiveNode:
-        """Put a node into service under its name.
+    def add(self, node: Node, control: Control, sequence: int | None = None) -> LiveNode:
+        """Put a node into service under its name; `sequence` is its place among equals.
 
         Raises:
             ConfigError: The name is taken, or a topic was declared with another type.
@@ -42,7 +42,8 @@ class Registry:
                 raise ConfigError(
                     "name", node.name, "is taken by another node; names must be unique"
                 )
-            live = LiveNode(node, self._timeline, control, self._added)
+            place = self._added if sequence is None else sequence
+            live = LiveNode(node, self._timeline, control, place)
             live.trigger = live.core.connect(self._bus)
             self._added += 1
             self._by_name[node.name] = live

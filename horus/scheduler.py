@@ -23,9 +23,16 @@ from horus.stats import TimingReport
 from horus.stream import MessageStream
 from horus.topics import Publisher
 from horus.units import to_s
-from horus.validation import check_count, check_duration, check_topic, optional_duration
+from horus.validation import (
+    check_count,
+    check_duration,
+    check_speed,
+    check_topic,
+    optional_duration,
+)
 
 if TYPE_CHECKING:
+    from horus.live import LiveNode
     from horus.recording.sessions import RecordedSession
 
 _APPLICATION = "application"
@@ -129,10 +136,7 @@ class Scheduler:
         """
         core = core_of(node)
         self._take_over(core)
-        live = self._registry.add(node, self._session.control)
-        core.owner = self
-        core.request_stop = self._session.control.request_stop
-        self._session.joined(live)
+        self._put_in(node, self._make_way(core.spec.name))
         return self
 
     def remove_node(self, name: str) -> bool:
@@ -163,6 +167,8 @@ class Scheduler:
         live = self._registry.get(name)
         if live.trigger is not None:
             raise ConfigError("rate", rate, f"{name!r} is released by messages, not by a rate")
+        if live.core.releases_ns is not None:
+            raise ConfigError("rate", rate, f"{name!r} is replayed as it was recorded")
         live.apply(live.spec.with_rate(rate))
         self._session.retimed(live)
 
@@ -539,12 +545,152 @@ class Scheduler:
 
         sessions.delete(name, self._recordings_directory())
 
+    # -- replay ------------------------------------------------------------------------
+
+    @classmethod
+    def replay_from(
+        cls,
+        path: str | os.PathLike[str],
+        nodes: Iterable[str] | None = None,
+        *,
+        topics: Iterable[str] | None = None,
+        classes: Iterable[type] = (),
+        **options: Any,
+    ) -> Self:
+        """Return a scheduler that re-runs a recorded session, in virtual time.
+
+        It has the cycles, the clock and the seed of the recording, and `run()` ends
+        where that ends. Time passes as it did, unless `set_replay_speed` says otherwise.
+        A node that is added takes the place of the recorded one of its name.
+
+        Args:
+            path: The recording; one whose process has died is recovered first.
+            nodes: Only what these have sent; None for all.
+            topics: Only what was sent on these; None for all.
+            classes: Classes that messages are made of, if they are neither dataclasses
+                nor Structs, named tuples or enumerations that are imported.
+            options: Keyword arguments of `Scheduler`.
+
+        Raises:
+            ConfigError: An argument was refused.
+            RecordingError: The file is no recording, is damaged, or lacks a node or a topic;
+                or its messages are of classes that may not come back.
+        """
+        from horus.recording.recovery import open_recording
+
+        with open_recording(path) as reader:
+            about = reader.about
+        recorded = {
+            "tick_rate": about["tick_rate_hz"],
+            "seed": about["seed"],
+            "name": about["name"],
+            "deterministic": True,
+        }
+        scheduler = cls(**{**recorded, **options})
+        scheduler._session.replays.rules_time = True
+        scheduler.set_replay_speed(1.0)
+        return scheduler.add_replay(path, nodes, topics=topics, classes=classes)
+
+    def add_replay(
+        self,
+        path: str | os.PathLike[str],
+        nodes: Iterable[str] | None = None,
+        *,
+        topics: Iterable[str] | None = None,
+        classes: Iterable[type] = (),
+    ) -> Self:
+        """Add stand-ins for nodes of a recording, which send again what those have sent.
+
+        The recording begins where the run does, or now while one is in progress. What is
+        replayed is kept in memory. Arguments and errors as for `replay_from`.
+
+        Raises:
+            ConfigError: Also: a node of the same name is here already.
+        """
+        stand_ins = self._session.replays.load(path, nodes, topics, classes)
+        for stand_in in stand_ins:
+            if stand_in.node.name in self._registry:
+                raise ConfigError(
+                    "nodes",
+                    stand_in.node.name,
+                    "is here already; remove it, or replay other nodes or topics",
+                )
+        for stand_in in stand_ins:
+            self._session.replays.adopt(stand_in, now=self._session.open)
+            self._put_in(stand_in.node)
+        return self
+
+    def start_at_tick(self, cycle: int) -> None:
+        """Begin the replay with this cycle of the recording; call it before the run.
+
+        With `replay_from`, `horus.tick()` and the clock begin there, too.
+
+        Raises:
+            RecordingError: The recording ends before.
+            StateError: Nothing is replayed, or it runs already.
+        """
+        self._refuse_while_running("start_at_tick")
+        self._session.replays.select(start=check_count("cycle", cycle))
+
+    def stop_at_tick(self, cycle: int) -> None:
+        """End the replay before this cycle of the recording; call it before the run.
+
+        Raises:
+            RecordingError: The recording ends before.
+            StateError: Nothing is replayed, or it runs already.
+        """
+        self._refuse_while_running("stop_at_tick")
+        self._session.replays.select(stop=check_count("cycle", cycle))
+
+    def set_replay_speed(self, speed: float) -> None:
+        """Replay slower or faster than recorded: 0.01 to 100 times, or `math.inf`.
+
+        In deterministic mode virtual time passes at this speed, `math.inf` (as fast as
+        possible) unless this is called; it may change while running. In real time
+        it is set before the run, to a finite speed.
+
+        Raises:
+            ConfigError: The speed is refused.
+            StateError: In real time, while running.
+        """
+        self._session.replays.set_speed(check_speed(speed), running=self._session.running)
+
+    def set_replay_override(self, topic: str, override: Any) -> None:
+        """Replay something else on a topic: a value, or what a function makes of each message.
+
+        The function gets the recorded message and returns another; None sends nothing.
+        """
+        self._session.replays.override(check_topic(topic), override)
+
+    def is_replaying(self) -> bool:
+        """Return whether something is left to replay."""
+        return self._session.replaying
+
     def _recordings_directory(self) -> Path:
         from horus.recording import sessions
 
         return self._spec.recording_directory or sessions.default_directory()
 
     # -- internals -------------------------------------------------------------------
+
+    def _put_in(self, node: Node, sequence: int | None = None) -> LiveNode:
+        live = self._registry.add(node, self._session.control, sequence)
+        live.core.owner = self
+        live.core.request_stop = self._session.control.request_stop
+        self._session.joined(live)
+        return live
+
+    def _make_way(self, name: str) -> int | None:
+        """Remove what stands in for a node; return its place in execution order."""
+        if name not in self._registry or not self._session.discard_stand_in(name):
+            return None
+        sequence = self._registry.get(name).sequence
+        self.remove_node(name)
+        return sequence
+
+    def _refuse_while_running(self, method: str) -> None:
+        if self._session.running:
+            raise StateError(f"{method}() must be called before the run")
 
     def _take_over(self, core: NodeCore) -> None:
         """Take a node from the scheduler it was in before."""

@@ -16,6 +16,7 @@ from horus.errors import NodeError, ShutdownTimeout, StateError
 from horus.executors import make_executors
 from horus.live import LiveNode
 from horus.loop.control import RunControl
+from horus.loop.pacer import Pacer
 from horus.loop.private_loop import StepLoop
 from horus.loop.runtime import Runtime, uninterrupted
 from horus.loop.simulation import Simulation
@@ -29,6 +30,7 @@ from horus.units import to_s
 
 if TYPE_CHECKING:
     from horus.recording.recordings import Recordings
+    from horus.recording.replay import Replays
 
 
 class Session:
@@ -78,6 +80,14 @@ class Session:
         self._loop: StepLoop | None = None
         self._streams: set[MessageStream] = set()
         self._recordings = self._make_recordings()
+        self.pacer = Pacer()
+        """Holds virtual time to real time, if asked to."""
+        self._replays: Replays | None = None
+
+    @property
+    def open(self) -> bool:
+        """Whether nodes are initialised, or are about to be."""
+        return self._open
 
     @property
     def running(self) -> bool:
@@ -110,6 +120,9 @@ class Session:
             keeps_open: Whether this is a step of a program that goes on: the nodes
                 stay initialised, and signals and logs are left to the program.
         """
+        if keeps_open:
+            self._refuse_to_step_replay()
+        duration_ns = self._natural_end(duration_ns)
         with self._driving(owns_process=not keeps_open, keeps_open=keeps_open):
             if self._spec.deterministic:
                 self._simulate(duration_ns, only)
@@ -127,6 +140,7 @@ class Session:
         Nodes that steps have initialised elsewhere are shut down first.
         """
         self.close_if_idle()
+        duration_ns = self._natural_end(duration_ns)
         with self._driving(owns_process=False):
             if self._spec.deterministic:
                 await self._simulate_beside_loop(duration_ns)
@@ -144,6 +158,7 @@ class Session:
 
     def step(self, only: list[LiveNode] | None) -> None:
         """Run one cycle on the calling thread; the nodes stay initialised."""
+        self._refuse_to_step_replay()
         self._take_charge()
         self._drivers.stepping = True
         self.oversight.begin_steps()
@@ -193,6 +208,40 @@ class Session:
     def stop_recording(self) -> list[Path]:
         """Record no more of this session; return its files, or those of the last one."""
         return [] if self._recordings is None else self._recordings.stop()
+
+    @property
+    def replays(self) -> Replays:
+        """The recordings that are replayed."""
+        if self._replays is None:
+            from horus.recording.replay import Replays  # it loads several libraries
+
+            self._replays = Replays(self.timeline, self.pacer)
+        return self._replays
+
+    @property
+    def replaying(self) -> bool:
+        """Whether something is left to replay."""
+        return self._replays is not None and self._replays.active
+
+    def discard_stand_in(self, name: str) -> bool:
+        """Replay a node no more; return whether it was replayed."""
+        return self._replays is not None and self._replays.discard(name)
+
+    def _refuse_to_step_replay(self) -> None:
+        if self.replaying and not self._spec.deterministic:
+            raise StateError("a replay is run step by step in deterministic mode only")
+
+    def _replay_begins(self) -> None:
+        if self._replays is not None:
+            begins_ns = self._replays.begin()
+            if self._sim_clock is not None:
+                self._sim_clock.advance_to(begins_ns)
+
+    def _natural_end(self, duration_ns: int | None) -> int | None:
+        """Return how long to run [ns]: as long as the recording whose time this is."""
+        if duration_ns is None and self._replays is not None and self._replays.rules_time:
+            return self._replays.length_ns()
+        return duration_ns
 
     def _make_recordings(self) -> Recordings | None:
         if not self._spec.recording:
@@ -289,6 +338,7 @@ class Session:
             self._open = True
             self.oversight.safety.reset()
             self.registry.renew()
+            self._replay_begins()
             if self._recordings is not None:
                 self._recordings.begin(self.registry.in_order)
 
@@ -370,7 +420,9 @@ class Session:
         if self._sim_clock is None:
             return Stepper(self.timeline, self._private_loop, self._stopping, safety)
         inspector = self.oversight.inspector()
-        return Simulation(self.timeline, self._sim_clock, self._stopping, safety, inspector)
+        return Simulation(
+            self.timeline, self._sim_clock, self._stopping, safety, inspector, self.pacer
+        )
 
     def _ready(self) -> None:
         if self._recordings is not None:

@@ -2,13 +2,35 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from typing import Protocol
 
 from horus.units import NS_PER_S
 
+FOREVER_NS = 1 << 63
+"""An instant [ns] that does not come."""
+
 _MAX_DENOMINATOR = 1_000_000
 _SAME_RATE = Fraction(1, 10**12)
+
+
+class Grid(Protocol):
+    """The instants at which something is released, counted from 0."""
+
+    def at(self, k: int) -> int:
+        """Return the instant of release `k` [ns]."""
+
+    def index_at(self, instant_ns: int) -> int:
+        """Return the last release at or before `instant_ns`; negative before release 0."""
+
+    def has(self, instant_ns: int) -> bool:
+        """Return whether something is released at exactly this instant."""
+
+    def first_from(self, instant_ns: int) -> int:
+        """Return the first release at or after `instant_ns`, at least 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +75,31 @@ class ReleaseGrid:
     def first_from(self, instant_ns: int) -> int:
         """Return the first release at or after `instant_ns`, at least 0."""
         return max(0, self.index_at(instant_ns - 1) + 1)
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseTimes:
+    """Releases at instants of their own, such as those of a recording; after them, none."""
+
+    epoch_ns: int
+    offsets_ns: Sequence[int]
+    """The instants after the epoch, ascending, each once."""
+
+    def at(self, k: int) -> int:
+        """Return the instant of release `k` [ns]."""
+        return self.epoch_ns + self.offsets_ns[k] if k < len(self.offsets_ns) else FOREVER_NS
+
+    def index_at(self, instant_ns: int) -> int:
+        """Return the last release at or before `instant_ns`; negative before release 0."""
+        return bisect_right(self.offsets_ns, instant_ns - self.epoch_ns) - 1
+
+    def has(self, instant_ns: int) -> bool:
+        """Return whether something is released at exactly this instant."""
+        return self.at(self.first_from(instant_ns)) == instant_ns
+
+    def first_from(self, instant_ns: int) -> int:
+        """Return the first release at or after `instant_ns`, at least 0."""
+        return bisect_left(self.offsets_ns, instant_ns - self.epoch_ns)
 
 
 def _exact(rate_hz: float) -> Fraction:

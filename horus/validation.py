@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import numbers
 import os
 import re
@@ -167,6 +168,16 @@ def check_count(argument: str, value: object, least: int = 0) -> int:
     if not is_int(value) or value < least:
         raise ConfigError(argument, value, f"must be a whole number >= {least}")
     return int(value)
+
+
+def check_speed(value: object) -> float:
+    """Return the speed of a replay: a multiple of the recorded one, or infinity."""
+    slowest, fastest = 0.01, 100.0
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ConfigError("speed", value, "must be a number: 1.0 is the recorded speed")
+    if value != math.inf and not slowest <= value <= fastest:
+        raise ConfigError("speed", value, f"must be between {slowest} and {fastest}, or math.inf")
+    return float(value)
 
 
 def check_cores(value: object) -> tuple[int, ...] | None:

@@ -6,6 +6,7 @@ before coverage is measured: `horus` itself is imported by the first fixture tha
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Generator, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -139,6 +140,15 @@ def fault(horus_scheduler: Scheduler) -> Iterator[Faults]:
 
 
 @pytest.fixture
-def replay() -> None:
-    """Refuse: there are no recordings to replay yet."""
-    pytest.fail("'replay' needs recordings, which are not part of this version of horus")
+def replay(horus_scheduler: Scheduler) -> Callable[..., float]:
+    """Return a function that replays a recording in `horus_scheduler`, and its length [s].
+
+    It takes the arguments of `Scheduler.add_replay`: `run_for(replay(path, ["lidar"]))` runs
+    the nodes under test on what the node `lidar` has sent.
+    """
+
+    def play(path: str | os.PathLike[str], nodes: Iterable[str] | None = None, **how: Any) -> float:
+        horus_scheduler.add_replay(path, nodes, **how)
+        return horus_scheduler._session.replays.length_ns() / 1e9
+
+    return play

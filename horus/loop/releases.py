@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from horus import clock
 from horus.live import LiveNode
-from horus.timing import ReleaseGrid
+from horus.timing import Grid
 
 Rank = tuple[int, int]
 
@@ -19,7 +19,7 @@ class _Release:
     """The next release of a node."""
 
     live: LiveNode
-    grid: ReleaseGrid
+    grid: Grid
     rank: Rank
     index: int
     last_ns: int

@@ -13,6 +13,7 @@ from horus.event_tick import EventTick
 from horus.graph import contradictions, dataflow_order
 from horus.live import LiveNode
 from horus.loop.inspector import Inspector
+from horus.loop.pacer import Pacer
 from horus.loop.private_loop import VirtualLoop
 from horus.loop.releases import ReleaseQueue
 from horus.loop.safety import Safety
@@ -32,7 +33,7 @@ class Simulation(Stepper):
     `advance` is its body::
 
         while something happens before the end:
-            move the clock to the earliest release or timer
+            move the clock to the earliest release or timer; paced, wait for it
             let async ticks go on whose sleep is over
             let the watchdog look at those that still wait
             for each node released at this instant, in execution order:
@@ -53,10 +54,12 @@ class Simulation(Stepper):
         stopped: Callable[[], bool],
         safety: Safety,
         inspector: Inspector,
+        pacer: Pacer,
     ) -> None:
         """Begin at the clock's instant, with no nodes."""
         super().__init__(timeline, self._virtual_loop, stopped, safety)
         self._inspector = inspector
+        self._pacer = pacer
         self._clock = sim_clock
         self._begun = False
         self._releases = ReleaseQueue()
@@ -151,11 +154,15 @@ class Simulation(Stepper):
             only: The nodes that may tick; None lets all of them.
         """
         self.begin_driving()
+        self._pacer.begin(self._clock.now_ns())
         try:
             self._deliver(only)
             while not self.stopped():
                 instant_ns = self._next_ns()
                 if instant_ns is None or (until_ns is not None and instant_ns >= until_ns):
+                    break
+                self._pacer.wait_until(instant_ns, self.stopped)
+                if self.stopped():
                     break
                 self._clock.advance_to(instant_ns)
                 self._settle()
@@ -167,8 +174,10 @@ class Simulation(Stepper):
                     if only is None or live in only:
                         self._release(live, release_ns)
                         self._deliver(only)
-            if until_ns is not None and not self.stopped():
-                self._clock.advance_to(until_ns)
+            if until_ns is not None:
+                self._pacer.wait_until(until_ns, self.stopped)
+                if not self.stopped():
+                    self._clock.advance_to(until_ns)
         finally:
             self.end_driving()
 

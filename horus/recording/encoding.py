@@ -370,7 +370,9 @@ def _class_called(name: Any, known: Classes) -> type:
     if not isinstance(kind, type) or name_of(kind) != name:
         raise ValueError(f"there is no class {name}; import it first")
     if not _consists_of_fields(kind):
-        raise ValueError(f"{name} is no dataclass, Struct, named tuple or Enum; name it in Pub()")
+        raise ValueError(
+            f"{name} is no dataclass, Struct, named tuple or Enum; pass it in classes="
+        )
     return kind
 
 

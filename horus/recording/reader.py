@@ -129,26 +129,34 @@ class RecordingReader:
         Raises:
             RecordingError: The file is damaged.
         """
-        for channel, sequence, log_ns, data in self.entries():
-            if channel.message_encoding != EXACT:
-                continue
-            if topics is not None and channel.topic not in topics:
-                continue
-            try:
-                _, _, cycle, _, release_ns = ENVELOPE.unpack_from(data)
-            except struct.error:
-                raise RecordingError(
-                    f"{self.path}: message {sequence} on topic {channel.topic!r} is cut short"
-                ) from None
-            yield RecordedMessage(
-                channel.topic,
-                channel.metadata.get("publisher", ""),
-                sequence,
-                cycle,
-                log_ns,
-                None if release_ns == OUTSIDE else release_ns,
-                bytes(data[ENVELOPE.size :]),
-            )
+        for entry in self.entries():
+            channel = entry.channel
+            wanted = topics is None or channel.topic in topics
+            if wanted and channel.message_encoding == EXACT:
+                yield self.message_of(entry)
+
+    def message_of(self, entry: Entry) -> RecordedMessage:
+        """Return what an entry of a topic's channel says.
+
+        Raises:
+            RecordingError: The file is damaged.
+        """
+        channel, sequence, log_ns, data = entry
+        try:
+            _, _, cycle, _, release_ns = ENVELOPE.unpack_from(data)
+        except struct.error:
+            raise RecordingError(
+                f"{self.path}: message {sequence} on topic {channel.topic!r} is cut short"
+            ) from None
+        return RecordedMessage(
+            channel.topic,
+            channel.metadata.get("publisher", ""),
+            sequence,
+            cycle,
+            log_ns,
+            None if release_ns == OUTSIDE else release_ns,
+            bytes(data[ENVELOPE.size :]),
+        )
 
     def facts(self, channel: str) -> Iterator[dict[str, Any]]:
         """Yield what is in a JSON channel, such as `horus/events`; `log_ns` is the time of each.
@@ -158,7 +166,7 @@ class RecordingReader:
         """
         for found, _, log_ns, data in self.entries():
             if found.topic == channel and found.message_encoding == "json":
-                yield {"log_ns": log_ns, **self._json(data, channel)}
+                yield {"log_ns": log_ns, **self.json_of(data, channel)}
 
     def entries(self) -> Iterator[Entry]:
         """Yield every message of every channel.
@@ -188,7 +196,12 @@ class RecordingReader:
             return about
         raise RecordingError(f"{self.path} does not say which scheduler was recorded")
 
-    def _json(self, data: memoryview, channel: str) -> dict[str, Any]:
+    def json_of(self, data: memoryview, channel: str) -> dict[str, Any]:
+        """Return what an entry of a JSON channel says.
+
+        Raises:
+            RecordingError: The file is damaged.
+        """
         try:
             return msgspec.json.decode(data, type=dict[str, Any])
         except ValueError as exc:

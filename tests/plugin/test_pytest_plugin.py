@@ -411,11 +411,31 @@ def test_a_node_that_fails_for_good_fails_the_test(pytester: pytest.Pytester) ->
     result.stdout.fnmatch_lines(["*ZeroDivisionError: in the tick*"])
 
 
-def test_replay_is_refused(pytester: pytest.Pytester) -> None:
-    """Until there are recordings."""
-    pytester.makepyfile("def test_replay(replay): pass")
-    result = run(pytester, errors=1)
-    result.stdout.fnmatch_lines(["*recordings, which are not part of this version*"])
+def test_a_recording_is_replayed_to_the_nodes_under_test(pytester: pytest.Pytester) -> None:
+    """`run_for(replay(path, nodes))` runs them on what was recorded."""
+    pytester.makepyfile(
+        """
+        from horus import Node, Scheduler
+
+        def test_replay(replay, run_for, horus_scheduler, topic_probe, tmp_path):
+            recorder = Scheduler(tick_rate=100, deterministic=True, recording=tmp_path)
+            recorder.add(Node("lidar", lambda node: node.send("scan", 1.5), rate=50, pubs=["scan"]))
+            recorder.run(duration=1.0)
+            (path,) = recorder.stop_recording()
+
+            def control(node):
+                for scan in node.recv_all("scan"):
+                    node.send("cmd", 2 * scan)
+
+            commands = topic_probe("cmd")
+            horus_scheduler.add(Node("control", control, rate=100, subs=["scan"], pubs=["cmd"]))
+            seconds = replay(path, ["lidar"])
+            assert 0.98 <= seconds <= 1.0
+            run_for(seconds)
+            assert commands.messages == [3.0] * 50
+        """
+    )
+    run(pytester, passed=1)
 
 
 def test_horus_is_imported_by_the_first_fixture_that_needs_it() -> None:
