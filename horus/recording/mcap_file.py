@@ -35,6 +35,8 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
+from horus.timing import FOREVER_NS
+
 PROFILE = "horus"
 CHUNK_SIZE = 64 * 1024
 """Size of a chunk before compression from which it is written [bytes]."""
@@ -123,7 +125,7 @@ class ChunkBuilder:
         self._records = bytearray()
         self._index: Index = {}
         self._schemas: set[int] = set()
-        self._first_ns = self._last_ns = 0
+        self._first_ns, self._last_ns = FOREVER_NS, 0
 
     @property
     def size(self) -> int:
@@ -138,7 +140,7 @@ class ChunkBuilder:
         if index is None:
             self._define(channel)
             index = self._index[channel] = []
-        if not self._first_ns or log_ns < self._first_ns:
+        if log_ns < self._first_ns:
             self._first_ns = log_ns
         if log_ns > self._last_ns:
             self._last_ns = log_ns
@@ -167,13 +169,13 @@ class ChunkBuilder:
         chunk = Chunk(
             compression=COMPRESSION,
             data=compressor.compress(records),
-            message_start_time=self._first_ns,
+            message_start_time=self._first_ns if index else 0,
             message_end_time=self._last_ns,
             uncompressed_crc=zlib.crc32(records),
             uncompressed_size=len(records),
         )
-        self._records, self._index, self._first_ns, self._last_ns = bytearray(), {}, 0, 0
-        self._schemas = set()
+        self._records, self._index, self._schemas = bytearray(), {}, set()
+        self._first_ns, self._last_ns = FOREVER_NS, 0
         return chunk, index
 
 

@@ -28,7 +28,8 @@ LAYERS = [
     ["session"],
     ["embedding"],
     ["scheduler"],
-    ["__init__", "testing"],
+    ["__init__", "testing", "cli"],
+    ["__main__"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
