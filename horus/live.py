@@ -40,6 +40,9 @@ class Control(Protocol):
     def request_stop(self, reason: str) -> None:
         """Stop in order."""
 
+    def give_up(self, reason: str) -> None:
+        """Stop in order, because something is wrong."""
+
     def fail(self, error: NodeError) -> None:
         """Stop in order, then raise `error` from `run()`."""
 
@@ -515,6 +518,9 @@ class _Nobody:
     """Listens to nothing: the control of a node that was left behind."""
 
     def request_stop(self, reason: str) -> None:
+        pass
+
+    def give_up(self, reason: str) -> None:
         pass
 
     def fail(self, error: NodeError) -> None:

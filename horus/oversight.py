@@ -39,7 +39,12 @@ class Oversight:
     """
 
     def __init__(
-        self, spec: SchedulerSpec, timeline: Timeline, registry: Registry, drivers: Drivers
+        self,
+        spec: SchedulerSpec,
+        timeline: Timeline,
+        registry: Registry,
+        drivers: Drivers,
+        safe_state_entered: Callable[[str], None],
     ) -> None:
         """Look after the nodes of `registry`, which `drivers` drive; nothing happens yet."""
         self._spec = spec
@@ -47,7 +52,7 @@ class Oversight:
         self._registry = registry
         self._drivers = drivers
         self.real_time = RealTime(spec)
-        self.safety = Safety(self._call_hooks)
+        self.safety = Safety(self._call_hooks, safe_state_entered)
         self.fault_log = FaultLog(spec.name)
         self._hooks = HookCaller(self.real_time, drivers.bridge, self.report)
         self._watched = spec.watchdog_ns > 0
@@ -135,8 +140,15 @@ class Oversight:
     # -- the process -------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def owning_process(self, request_stop: Callable[[str], None]) -> Iterator[None]:
-        """Own the signals and tell the service manager in the block."""
+    def owning_process(
+        self, request_stop: Callable[[str], None], dump: Callable[[str], None]
+    ) -> Iterator[None]:
+        """Own the signals and tell the service manager in the block.
+
+        Args:
+            request_stop: Ends the run in order, for a reason.
+            dump: Writes the flight recorder, for a reason; returns at once.
+        """
         make_safe = LastAct(
             self._make_safe,
             lambda: _LAST_ACTS_S + self._hooks.limit_s(len(self._registry.in_order)),
@@ -145,7 +157,13 @@ class Oversight:
             self._shut_down,
             lambda: _LAST_ACTS_S + len(self._registry.in_order) * self._shutdown_timeout_s,
         )
-        signals = self._signals = SignalOwner(request_stop, make_safe, shut_down, in_callback)
+        signals = self._signals = SignalOwner(
+            request_stop,
+            make_safe,
+            shut_down,
+            in_callback,
+            dump if self._spec.blackbox_mb else None,
+        )
         with signals.owning():
             self._notifier = find_notifier()
             try:

@@ -73,7 +73,10 @@ class Scheduler:
             rt: Ask for SCHED_FIFO, locked memory and no garbage collection in ticks;
                 `degradations()` tells what was refused.
             deterministic: Run in virtual time on one thread, reproducibly.
-            blackbox_mb: Size of the flight recorder [MB]; 0 for none. Not in this version.
+            blackbox_mb: Size of the flight recorder [MB]; 0 for none. It keeps the latest of
+                what `recording` records in a file of that size, and writes it to a session
+                on a fatal stop, when a critical node freezes, on SIGUSR2 during `run()`, by
+                `dump_blackbox()`, and at the next start if the process dies.
             watchdog_ms: Timeout after which a tick counts as frozen [ms]; 0 for never.
                 See `add_critical_node` and `Node(watchdog=)`.
             recording: Record every session: True, or the directory where its files go.
@@ -544,6 +547,17 @@ class Scheduler:
         from horus.recording import sessions
 
         sessions.delete(name, self._recordings_directory())
+
+    def dump_blackbox(self, reason: str | None = None) -> Path:
+        """Write what the flight recorder has to a session of its own; return its file.
+
+        Raises:
+            StateError: There is none, or nothing runs: without `blackbox_mb=`, say.
+            RecordingError: It cannot be written: the disk is full, say.
+
+        Thread: any, but a callback waits for the disk.
+        """
+        return self._session.dump_blackbox(reason or "dump_blackbox() was called")
 
     # -- replay ------------------------------------------------------------------------
 

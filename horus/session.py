@@ -62,7 +62,9 @@ class Session:
         )
         self.registry = Registry(self.bus, self.timeline)
         self._drivers = Drivers()
-        self.oversight = Oversight(spec, self.timeline, self.registry, self._drivers)
+        self.oversight = Oversight(
+            spec, self.timeline, self.registry, self._drivers, self._safe_state_entered
+        )
         self.control = RunControl(spec.max_deadline_misses, self.oversight.critical_late)
         self.status = "idle"
         self.started = False
@@ -243,8 +245,27 @@ class Session:
             return self._replays.length_ns()
         return duration_ns
 
+    def dump_blackbox(self, reason: str) -> Path:
+        """Write what the flight recorder has; return its file.
+
+        Raises:
+            StateError: There is none, or nothing runs.
+            RecordingError: It cannot be written.
+        """
+        if self._recordings is None:
+            raise StateError("there is no flight recorder: it needs blackbox_mb=")
+        return self._recordings.dump(reason)
+
+    def _dump_blackbox_soon(self, reason: str) -> None:
+        if self._recordings is not None:
+            self._recordings.dump_soon(reason)
+
+    def _safe_state_entered(self, reason: str) -> None:
+        if self._recordings is not None:
+            self._recordings.safe_state_entered(reason)
+
     def _make_recordings(self) -> Recordings | None:
-        if not self._spec.recording:
+        if not (self._spec.recording or self._spec.blackbox_mb):
             return None
         from horus.recording.recordings import Recordings  # it loads several libraries
 
@@ -305,7 +326,11 @@ class Session:
             around.callback(self._become_idle)
             around.enter_context(logs.visible(install=owns_process, verbose=self._spec.verbose))
             if owns_process:
-                around.enter_context(self.oversight.owning_process(self.control.request_stop))
+                around.enter_context(
+                    self.oversight.owning_process(
+                        self.control.request_stop, self._dump_blackbox_soon
+                    )
+                )
             around.callback(self._hand_back, keeps_open=keeps_open)
             try:
                 yield
@@ -377,7 +402,7 @@ class Session:
             for stream in tuple(self._streams):
                 stream.close()
             if self._recordings is not None:
-                self._recordings.stop()
+                self._recordings.close(self.control.fault)
             clock.clear_ambient(self.timeline)
 
     def _all(self) -> tuple[LiveNode, ...]:

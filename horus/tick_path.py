@@ -241,7 +241,7 @@ def _act(
             kind, limit_ns, over_ns = "budget", limits.budget_ns, outcome.over_budget_ns
         text = live.reports.limit_exceeded(kind, limit_ns, over_ns)
         if action.stop:
-            live.control.request_stop(f"node {live.name!r} {text}")
+            live.control.give_up(f"node {live.name!r} {text}")
     if action.skip_next:
         live.skip_next = live.gated = True
     if action.fatal and error is not None:

@@ -8,10 +8,7 @@ from horus.spec import SchedulerSpec
 
 def warn_of_scheduler(spec: SchedulerSpec) -> None:
     """Warn of the arguments of a scheduler that have no effect."""
-    for asked, argument, consequence in (
-        (spec.blackbox_mb, "blackbox_mb=", "there is no flight recorder"),
-        (spec.telemetry, "telemetry=", "no metrics are sent"),
-    ):
+    for asked, argument, consequence in ((spec.telemetry, "telemetry=", "no metrics are sent"),):
         if asked:
             warn(argument, consequence)
 

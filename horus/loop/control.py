@@ -31,12 +31,15 @@ class RunControl:
         self._on_stop: Callable[[], None] | None = None
         self.stop_reason: str | None = None
         self.failure: NodeError | None = None
+        self.fault: str | None = None
+        """Why the run had to end: a failure, or deadlines that were missed."""
 
     def begin(self, on_stop: Callable[[], None]) -> None:
         """Start a run that `on_stop` ends."""
         self._misses = 0
         self.stop_reason = None
         self.failure = None
+        self.fault = None
         self._on_stop = on_stop
 
     def end(self) -> None:
@@ -60,7 +63,13 @@ class RunControl:
         """Stop in order; `run()` then raises `error`."""
         if self.failure is None:
             self.failure = error
-        self.request_stop(str(error))
+        self.give_up(str(error))
+
+    def give_up(self, reason: str) -> None:
+        """Stop in order, because something is wrong."""
+        if self.fault is None:
+            self.fault = reason
+        self.request_stop(reason)
 
     def count_miss(self) -> None:
         """Stop when the limit on missed deadlines is reached."""
@@ -75,6 +84,6 @@ class RunControl:
                     misses,
                 )
         elif misses >= self._max_deadline_misses:
-            self.request_stop(
+            self.give_up(
                 f"{misses} deadlines were missed, max_deadline_misses={self._max_deadline_misses}"
             )

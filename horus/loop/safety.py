@@ -29,9 +29,12 @@ class Safety:
     Thread: any.
     """
 
-    def __init__(self, call_hooks: CallHooks) -> None:
-        """Begin with nobody held."""
+    def __init__(
+        self, call_hooks: CallHooks, entered: Callable[[str], None] = lambda reason: None
+    ) -> None:
+        """Begin with nobody held; `entered` is told why the system has entered its safe state."""
         self._call_hooks = call_hooks
+        self._entered = entered
         self._lock = threading.Lock()
         self.reason: str | None = None
         """Why the system-wide safe state was entered; None while it is not."""
@@ -63,6 +66,7 @@ class Safety:
             # Asked for now: who begins to take part later finds the safe state active.
             owed = self._hold(sorted(lives(), key=lambda live: live.rank, reverse=True))
         self._call(owed)
+        self._entered(reason)
         return True
 
     def join(self, live: LiveNode) -> None:

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM while a run owns them."""
+"""SIGINT, SIGTERM and SIGUSR2 while a run owns them."""
 
 from __future__ import annotations
 
@@ -34,6 +34,8 @@ class LastAct(NamedTuple):
 class SignalOwner:
     """Turns the first SIGINT or SIGTERM into a stop, and lets a second one force exit.
 
+    With a flight recorder, SIGUSR2 has it written.
+
     Python-level handlers, not `loop.add_signal_handler`: they also run while a
     node's Python code blocks the loop, and they can be put back as they were
     (`remove_signal_handler` installs the default instead).
@@ -45,6 +47,7 @@ class SignalOwner:
         make_safe: LastAct,
         shut_down: LastAct,
         in_callback: InCallback,
+        dump: Callable[[str], None] | None = None,
     ) -> None:
         """Own the signals from `owning` on.
 
@@ -53,10 +56,12 @@ class SignalOwner:
             make_safe: Precedes every forced end.
             shut_down: Follows, unless somebody who asks a second time wants it to be over.
             in_callback: Tells whether a frame of the main thread is in a node's callback.
+            dump: Writes the flight recorder, for a reason, if there is one.
         """
         self._stop = stop
         self._make_safe, self._shut_down = make_safe, shut_down
         self._in_callback = in_callback
+        self._dump = dump
         self._received = 0
         self._pid = os.getpid()
         self._interrupting = False
@@ -71,7 +76,12 @@ class SignalOwner:
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        previous = {number: signal.signal(number, self._handle) for number in _OWNED}
+        handlers: dict[signal.Signals, Callable[[int, FrameType | None], None]] = dict.fromkeys(
+            _OWNED, self._handle
+        )
+        if self._dump is not None:
+            handlers[signal.SIGUSR2] = self._handle_dump
+        previous = {number: signal.signal(number, handler) for number, handler in handlers.items()}
         self.owns = True
         try:
             yield
@@ -102,6 +112,10 @@ class SignalOwner:
         """End the process with the exit code of the signal that was received, else 1."""
         code = 128 + self._received if self._received else 1
         _end(code, why, (self._make_safe, self._shut_down))
+
+    def _handle_dump(self, number: int, frame: FrameType | None) -> None:
+        if self._dump is not None and os.getpid() == self._pid:
+            self._dump("received SIGUSR2")
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if os.getpid() != self._pid:

@@ -15,6 +15,7 @@ import os
 import struct
 import zlib
 from collections import Counter
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -77,7 +78,7 @@ class Summary:
 
     def end(self, start: int) -> bytes:
         """Return the end of a file whose data ends at `start`, which this end begins at."""
-        head = _packed(DataEnd(0))
+        head = packed(DataEnd(0))
         start += len(head)
         body = bytearray()
         offsets: list[SummaryOffset] = []
@@ -89,13 +90,13 @@ class Summary:
         ]
         for opcode, records in groups:
             if records:
-                group = _packed(*records)
+                group = packed(*records)
                 offsets.append(SummaryOffset(opcode, start + len(body), len(group)))
                 body += group
         offsets_start = start + len(body)
-        body += _packed(*offsets)
+        body += packed(*offsets)
         # The checksum covers the footer, too, up to itself.
-        footer = _packed(Footer(start, offsets_start, 0))[:-4]
+        footer = packed(Footer(start, offsets_start, 0))[:-4]
         crc = zlib.crc32(footer, zlib.crc32(body))
         return b"".join((head, body, footer, struct.pack("<I", crc), MCAP0_MAGIC))
 
@@ -160,8 +161,8 @@ class ChunkBuilder:
         schema = definition.schema_id
         if schema and schema not in self._schemas:
             self._schemas.add(schema)
-            self._records += _packed(self._summary.schemas[schema])
-        self._records += _packed(definition)
+            self._records += packed(self._summary.schemas[schema])
+        self._records += packed(definition)
 
     def take(self, compressor: zstandard.ZstdCompressor) -> tuple[Chunk, Index]:
         """Return what was gathered, with its index."""
@@ -225,13 +226,15 @@ class AppendedFile:
         os.fdatasync(self._descriptor)
 
 
-def begin(file: AppendedFile, library: str) -> None:
+def begin(file: AppendedFile) -> None:
     """Write the head of a new file.
 
     Raises:
         OSError: It could not be written.
     """
-    file.append(MCAP0_MAGIC + _packed(Header(PROFILE, library)))
+    file.append(
+        MCAP0_MAGIC + packed(Header(PROFILE, f"horus {metadata.version('horus-scheduler')}"))
+    )
 
 
 def append_chunk(file: Output, summary: Summary, chunk: Chunk, index: Index) -> None:
@@ -240,7 +243,7 @@ def append_chunk(file: Output, summary: Summary, chunk: Chunk, index: Index) -> 
     Raises:
         OSError: It could not be written.
     """
-    head = _packed(chunk)
+    head = packed(chunk)
     records, offsets = _packed_index(index)
     start = file.append(head + records)
     entry = chunk_index(chunk, start, len(head))
@@ -306,7 +309,8 @@ def create(path: Path) -> int:
     return os.open(path, flags, 0o644)
 
 
-def _packed(*records: McapRecord) -> bytes:
+def packed(*records: McapRecord) -> bytes:
+    """Return records as bytes."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)

@@ -2,44 +2,78 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
-from importlib import metadata
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Protocol, TypeVar
 
 import zstandard
+from mcap.records import Chunk
 
 from horus import clock
-from horus.clock import NEVER, Timeline
+from horus.clock import FOREVER_NS, NEVER, Timeline
 from horus.live import NoteTick
-from horus.recording import mcap_file, sessions
+from horus.recording import mcap_file
 from horus.recording.scribe import Fact, Item, Log, Message, Scribe, Tick
 from horus.snapshot import Frozen
 from horus.topics import Publisher
-from horus.units import NS_PER_MS, NS_PER_S
+from horus.units import NS_PER_S, to_ns
 
 _log = logging.getLogger("horus.recording")
+T = TypeVar("T")
 
 MOST_UNWRITTEN = 65_536
 """Items that may wait to be written."""
 _LONGEST_STALL_NS = 3 * NS_PER_S
 """How long writing may stand still before items are dropped [ns]: large ones fill the memory."""
 _DRAIN_PERIOD_S = 0.025
-_FLUSH_PERIOD_NS = 100 * NS_PER_MS
-"""At most so much later is in the file what was recorded [ns]; a full chunk is written at once."""
 _SYNC_PERIOD_NS = 1 * NS_PER_S
 """At most so much later it survives a power cut [ns], unless the disk is slow."""
 _FINISH_TIMEOUT_S = 5.0
 """How long the end of a run waits for the last items to be written [s]."""
 
 
+class Sink(Protocol):
+    """Where chunks go. Thread: one at a time."""
+
+    lost: int
+    """How many items were in chunks that it could not take."""
+
+    def write(self, chunk: Chunk, index: mcap_file.Index) -> int:
+        """Take a chunk; return its size [bytes]. Never raises."""
+
+    def sync(self) -> None:
+        """Have what was written survive a power cut, if it is made for that."""
+
+    def finish(self) -> None:
+        """Take note that this was all."""
+
+    def close(self) -> None:
+        """Give back what it holds."""
+
+
+class _Job:
+    """Something to be done by the thread that writes, at its turn."""
+
+    def __init__(self, work: Callable[[], Any], due_ns: int) -> None:
+        self.due_ns = due_ns
+        self.done = threading.Event()
+        self.result: Any = None
+        self.error: Exception | None = None
+        self._work = work
+
+    def run(self) -> None:
+        try:
+            self.result = self._work()
+        except Exception as exc:
+            self.error = exc
+        finally:
+            self.done.set()
+
+
 class Recorder:
-    """Records into one file, from its construction to `finish`.
+    """Records into sinks, from `start` to `finish`.
 
     What happens is queued on the thread that it happens on, in the order in which it does, and
     written by one thread. When that does not keep up, because the disk does not, items are
@@ -49,23 +83,20 @@ class Recorder:
     Thread: any.
     """
 
-    def __init__(self, directory: Path, timeline: Timeline, about: Mapping[str, Any]) -> None:
-        """Begin a session.
+    def __init__(self, timeline: Timeline, about: Mapping[str, Any], flush_ns: int) -> None:
+        """Begin to queue; `start` begins to write.
 
         Args:
-            directory: Where its file goes.
             timeline: The scheduler's time.
             about: The scheduler's configuration.
-
-        Raises:
-            OSError: The file cannot be made or written.
+            flush_ns: At most so much later a sink has what happens [ns]; a full chunk at once.
         """
-        self.path, descriptor = sessions.create(directory)
         self.patient: frozenset[str] = frozenset()
         """The nodes that wait rather than lose a message."""
         self._timeline = timeline
         self._now_ns = timeline.now_ns
-        self._queue: deque[Item] = deque()
+        self._queue: deque[Item | _Job] = deque()
+        self._jobs: list[_Job] = []
         self._lock = threading.Lock()
         self._lost = 0
         self._recording = True
@@ -73,23 +104,36 @@ class Recorder:
         self._progress_ns = self._told_ns = clock.monotonic_ns()
         self._told_lost = 0
         self._told_of: set[str] = set()
-        self._file = _Session(descriptor, self.path)
-        try:
-            self._file.begin()
-        except BaseException:
-            self._file.close()
-            raise
-        self._scribe = Scribe(self._file, timeline.wall_offset_ns)
+        self._chunks = _Chunks(flush_ns)
+        self._scribe = Scribe(self._chunks, timeline.wall_offset_ns)
+        self._configuration: dict[tuple[str, str], Fact] = {}
+        self._refresh_size: int | None = None
+        self._refreshed_at = 0
         self._handler = _LogHandler(self.note_log)
-        logging.getLogger("horus").addHandler(self._handler)
-        self.note_fact("horus/scheduler", about)
         self._thread = threading.Thread(target=self._write, name="horus-recorder", daemon=True)
-        self._thread.start()
+        self.note_fact("horus/scheduler", about)
+
+    @property
+    def definitions(self) -> mcap_file.Summary:
+        """The schemas and channels that the chunks refer to."""
+        return self._chunks.definitions
 
     @property
     def lost(self) -> int:
         """How many items were dropped, because writing them did not keep up or failed."""
-        return self._lost + self._file.lost
+        return self._lost + sum(sink.lost for sink in self._chunks.sinks)
+
+    def start(self, sinks: Iterable[Sink], refresh_size: int | None = None) -> None:
+        """Write to sinks, which it owns from now on.
+
+        Args:
+            sinks: Where chunks go.
+            refresh_size: After so many bytes the configuration is written again.
+        """
+        self._chunks.sinks.extend(sinks)
+        self._refresh_size = refresh_size
+        logging.getLogger("horus").addHandler(self._handler)
+        self._thread.start()
 
     # -- what happens --------------------------------------------------------------------
 
@@ -138,7 +182,10 @@ class Recorder:
 
     def note_fact(self, channel: str, content: Mapping[str, Any]) -> None:
         """Take note of something that has a channel of its own."""
-        self._put(Fact(channel, self._now_ns(), content), "")
+        fact = Fact(channel, self._now_ns(), content)
+        if channel != "horus/events":
+            self._configuration[channel, content["name"]] = fact
+        self._put(fact, "")
 
     def note_log(self, record: logging.LogRecord, text: str) -> None:
         """Take note of a log record, and how it reads."""
@@ -169,16 +216,50 @@ class Recorder:
 
     # -- the thread that writes ----------------------------------------------------------
 
+    def do(self, work: Callable[[], T], timeout_s: float = _FINISH_TIMEOUT_S) -> T:
+        """Have something done with the sinks, once what has happened so far is in them.
+
+        Raises:
+            TimeoutError: It was not done in time: writing does not keep up.
+            Exception: What `work` raises.
+        """
+        job = self.do_soon(work)
+        if not job.done.wait(timeout_s):
+            raise TimeoutError(f"recording did not come to it within {timeout_s:g} s")
+        if job.error is not None:
+            raise job.error
+        result: T = job.result
+        return result
+
+    def do_soon(self, work: Callable[[], Any], delay_s: float = 0.0) -> _Job:
+        """Have something done with the sinks; do not wait for it.
+
+        Thread: any, and signal handlers.
+        """
+        job = _Job(work, clock.monotonic_ns() + to_ns(delay_s))
+        self._queue.append(job)
+        return job
+
+    def release(self, sink: Sink) -> None:
+        """Let a sink go: it gets its end, and nothing more.
+
+        Thread: within `do`.
+        """
+        self._chunks.sinks.remove(sink)
+        try:
+            sink.finish()
+        finally:
+            sink.close()
+
     def finish(self) -> None:
-        """Write what is left, and the end of the file; record no more."""
+        """Write what is left, and give each sink its end; record no more."""
         self._recording = False
         logging.getLogger("horus").removeHandler(self._handler)
         self._ending.set()
         self._thread.join(_FINISH_TIMEOUT_S)
         if self._thread.is_alive():
             _log.error(
-                "%s: %d items could not be written within %g s; the session is unfinished",
-                self.path,
+                "%d items could not be recorded within %g s; the session is unfinished",
                 len(self._queue),
                 _FINISH_TIMEOUT_S,
             )
@@ -189,22 +270,47 @@ class Recorder:
                 self._drain()
                 self._tell_losses()
             self._drain()
+            self._do_jobs(FOREVER_NS)
             self._tell_losses(finally_=True)
-            self._file.finish()
+            self._chunks.flush()
         finally:
             self._recording = False
-            self._file.close()
+            for sink in list(self._chunks.sinks):
+                self.release(sink)
 
     def _drain(self) -> None:
         """Write what waits now."""
-        queue, write, file = self._queue, self._scribe.write, self._file
+        queue, write, chunks = self._queue, self._scribe.write, self._chunks
         for _ in range(len(queue)):
-            write(queue.popleft())
-            if file.full:
-                file.flush()
+            item = queue.popleft()
+            if isinstance(item, _Job):
+                self._jobs.append(item)
+                self._do_jobs(clock.monotonic_ns())
+                continue
+            write(item)
+            if chunks.full:
+                chunks.flush()
                 self._progress_ns = clock.monotonic_ns()
-        file.flush_if_due()
+        if self._jobs:
+            self._do_jobs(clock.monotonic_ns())
+        self._refresh()
+        chunks.flush_if_due()
         self._progress_ns = clock.monotonic_ns()
+
+    def _do_jobs(self, now_ns: int) -> None:
+        due = [job for job in self._jobs if job.due_ns <= now_ns]
+        self._jobs = [job for job in self._jobs if job.due_ns > now_ns]
+        for job in due:
+            self._chunks.flush()
+            job.run()
+
+    def _refresh(self) -> None:
+        """Write the configuration again, where what is old is overwritten."""
+        size, written = self._refresh_size, self._chunks.written
+        if size is not None and written - self._refreshed_at >= size:
+            self._refreshed_at = written
+            for fact in list(self._configuration.values()):
+                self._scribe.write(fact._replace(at_ns=self._now_ns()))
 
     def _tell_losses(self, *, finally_: bool = False) -> None:
         """Say what was lost since this was said before, once a second."""
@@ -221,74 +327,48 @@ class Recorder:
             text = f"{lost} items were lost, because writing does not keep up"
             content = {"kind": "lost", "node": "", "text": text}
             self._scribe.write(Fact("horus/events", self._now_ns(), content))
-            _log.error("%s: %s", self.path, text)
+            _log.error("%s", text)
 
 
-class _Session:
-    """The file of a session, chunk by chunk; that it cannot be written is told once.
+class _Chunks:
+    """Gathers records in chunks, and hands these to the sinks.
 
     Thread: one at a time.
     """
 
-    def __init__(self, descriptor: int, path: Path) -> None:
-        self.lost = 0
-        """How many items were in chunks that could not be written."""
-        self._descriptor = descriptor
-        self._path = path
-        self._file = mcap_file.AppendedFile(descriptor)
-        self._summary = mcap_file.Summary()
-        self._chunk = mcap_file.ChunkBuilder(self._summary)
-        self.define = self._summary.define
+    def __init__(self, flush_ns: int) -> None:
+        self.definitions = mcap_file.Summary()
+        self.sinks: list[Sink] = []
+        self._chunk = mcap_file.ChunkBuilder(self.definitions)
+        self.define = self.definitions.define
         self.add_message = self._chunk.add_message
         self._compressor = zstandard.ZstdCompressor(level=1)
-        self._failing = False
+        self._flush_ns = flush_ns
         self._flushed_ns = self._synced_ns = clock.monotonic_ns()
+        self.written = 0
+        """How much was written to the last sink [bytes]."""
 
     @property
     def full(self) -> bool:
         return self._chunk.size >= mcap_file.CHUNK_SIZE
 
-    def begin(self) -> None:
-        mcap_file.begin(self._file, f"horus {metadata.version('horus-scheduler')}")
-
     def flush_if_due(self) -> None:
         now_ns = clock.monotonic_ns()
-        if self._chunk.size and now_ns - self._flushed_ns >= _FLUSH_PERIOD_NS:
+        if now_ns - self._flushed_ns >= self._flush_ns:
             self.flush()
         if now_ns - self._synced_ns >= _SYNC_PERIOD_NS:
             self._synced_ns = now_ns
-            with contextlib.suppress(OSError):  # told when writing fails
-                self._file.sync()
+            for sink in self.sinks:
+                sink.sync()
 
     def flush(self) -> None:
-        """Write what was gathered; if that fails, it is lost, and the next may fare better."""
+        """Hand over what was gathered."""
         self._flushed_ns = clock.monotonic_ns()
+        if not self._chunk.size:
+            return
         chunk, index = self._chunk.take(self._compressor)
-        try:
-            mcap_file.append_chunk(self._file, self._summary, chunk, index)
-        except OSError as exc:
-            self.lost += sum(len(entries) // 2 for entries in index.values())
-            if not self._failing:
-                self._failing = True
-                _log.error("%s cannot be written, and the robot runs on: %s", self._path, exc)
-        else:
-            if self._failing:
-                self._failing = False
-                _log.warning("%s can be written again; %d items were lost", self._path, self.lost)
-
-    def finish(self) -> None:
-        """Write the end."""
-        self.flush()
-        try:
-            self._file.append(self._summary.end(self._file.size))
-            self._file.sync()
-        except OSError as exc:
-            if not self._failing:
-                _log.error("%s is unfinished: %s", self._path, exc)
-
-    def close(self) -> None:
-        """Close it, which gives its lock back."""
-        os.close(self._descriptor)
+        for sink in self.sinks:
+            self.written += sink.write(chunk, index)
 
 
 class _LogHandler(logging.Handler):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Schema
+from mcap.records import Channel, Chunk, ChunkIndex, Schema
 
 from horus.errors import RecordingError
 from horus.recording import mcap_file, reader, sessions
@@ -118,7 +118,16 @@ def _survey(file: BinaryIO) -> _Survey:
         if record.opcode == Opcode.CHUNK:
             if chunk is not None:
                 found.summary.add_chunk(*chunk)
-            chunk = _survey_chunk(found, record)
+            try:
+                head, definitions, index = survey_chunk(record.content)
+            except ValueError:
+                found.damaged.append(record)
+                chunk = None
+            else:
+                for definition in definitions:
+                    found.summary.define(definition)
+                length = record.end - record.offset
+                chunk = mcap_file.chunk_index(head, record.offset, length), index
         elif record.opcode == Opcode.MESSAGE_INDEX and chunk is not None:
             entry, _ = chunk
             (channel,) = _CHANNEL.unpack_from(record.content)
@@ -137,27 +146,24 @@ def _survey(file: BinaryIO) -> _Survey:
     return found
 
 
-def _survey_chunk(found: _Survey, record: Record) -> tuple[ChunkIndex, mcap_file.Index] | None:
-    """Return what the summary says of a chunk, and its index; None if it cannot be read."""
+def survey_chunk(content: bytes) -> tuple[Chunk, list[Schema | Channel], mcap_file.Index]:
+    """Return a chunk, what it defines, and its index.
+
+    Raises:
+        ValueError: It is damaged.
+    """
     index: mcap_file.Index = {}
     definitions: list[Schema | Channel] = []
-    try:
-        head, data = reader.unpack(record.content)
-        view = memoryview(data)
-        for opcode, start, end in reader.walk(data):
-            if opcode == Opcode.MESSAGE:
-                _, _, channel, _, log_ns, _ = reader.head_of_message(data, start)
-                index.setdefault(channel, []).extend((log_ns, start))
-            elif opcode == Opcode.SCHEMA:
-                definitions.append(reader.definition(Schema, view[start:end]))
-            elif opcode == Opcode.CHANNEL:
-                definitions.append(reader.definition(Channel, view[start:end]))
-    except ValueError:
-        found.damaged.append(record)
-        return None
+    chunk, data = reader.unpack(content)
+    view = memoryview(data)
+    for opcode, start, end in reader.walk(data):
+        if opcode == Opcode.MESSAGE:
+            _, _, channel, _, log_ns, _ = reader.head_of_message(data, start)
+            index.setdefault(channel, []).extend((log_ns, start))
+        elif opcode == Opcode.SCHEMA:
+            definitions.append(reader.definition(Schema, view[start:end]))
+        elif opcode == Opcode.CHANNEL:
+            definitions.append(reader.definition(Channel, view[start:end]))
     if index.keys() != {it.id for it in definitions if isinstance(it, Channel)}:
-        found.damaged.append(record)
-        return None
-    for definition in definitions:
-        found.summary.define(definition)
-    return mcap_file.chunk_index(head, record.offset, record.end - record.offset), index
+        raise ValueError("a chunk does not define its channels")
+    return chunk, definitions, index

@@ -52,8 +52,10 @@ class _Track:
     """What one node has sent."""
 
     name: str
-    about: dict[str, Any]
+    about: dict[str, Any] = field(default_factory=dict)
     """The node's configuration; empty for the application."""
+    heard: list[tuple[RecordedMessage, bool] | None] = field(default_factory=list)
+    """Each message, and whether the run had begun; None for the end of a tick."""
     early: list[RecordedMessage] = field(default_factory=list)
     """What it sent before the run, in `init()`."""
     saved: list[_Saved] = field(default_factory=list)
@@ -73,16 +75,23 @@ class _Track:
         sent = (saved.message.topic for saved in self.saved)
         return list(dict.fromkeys([*(message.topic for message in self.early), *sent]))
 
-    def add(self, message: RecordedMessage, deterministic: bool, started: bool) -> None:
-        release_ns = message.release_ns
-        if release_ns is None and not started:
-            self.early.append(message)
-            return
+    def sort_out(self, deterministic: bool) -> None:
+        """Decide what is to be sent when."""
         at_release = self.is_async or deterministic or self.execution_class in _TIMED
-        due_ns = message.sent_ns if release_ns is None or not at_release else release_ns
-        if self.saved:
-            due_ns = max(due_ns, self.saved[-1].due_ns)
-        self.saved.append(_Saved(due_ns, message.sent_ns, message))
+        latest_ns = 0
+        for each in self.heard:
+            if each is None:
+                self.tick_ends.append(len(self.saved))
+                continue
+            message, started = each
+            release_ns = message.release_ns
+            if release_ns is None and not started:
+                self.early.append(message)
+                continue
+            due_ns = message.sent_ns if release_ns is None or not at_release else release_ns
+            latest_ns = max(latest_ns, due_ns)
+            self.saved.append(_Saved(latest_ns, message.sent_ns, message))
+        self.heard.clear()
 
 
 @dataclass(slots=True)
@@ -149,27 +158,31 @@ def _load(
                     continue
                 if wanted_topics is not None and topic not in wanted_topics:
                     continue
-                if publisher not in tracks:
-                    about = configurations.get(publisher, {})
-                    tracks[publisher] = _Track(publisher, about)
-                deterministic = bool(reader.about["deterministic"])
-                tracks[publisher].add(message, deterministic, started=len(runs) > 1)
+                track = tracks.setdefault(publisher, _Track(publisher))
+                track.heard.append((message, bool(runs)))
             elif topic.startswith(_TICKS):
                 last_ns = max(last_ns, entry.log_ns)
-                track = tracks.get(topic.removeprefix(_TICKS))
-                if track is not None:
-                    track.tick_ends.append(len(track.saved))
+                ticked = tracks.get(topic.removeprefix(_TICKS))
+                if ticked is not None:
+                    ticked.heard.append(None)
             elif topic == "horus/nodes":
                 found = reader.json_of(entry.data, topic)
                 configurations[found["name"]] = found
             elif topic == "horus/scheduler":
                 found = reader.json_of(entry.data, topic)
-                runs.append((found["cycle"], found["epoch_ns"]))
+                if found["running"]:
+                    runs.append((found["cycle"], found["epoch_ns"]))
         _refuse_unknown(reader, "node", wanted_nodes, all_nodes)
         _refuse_unknown(reader, "topic", wanted_topics, all_topics)
-        in_sequence = sorted(tracks.values(), key=lambda track: track.about.get("sequence", -1))
-        # The first one is written before the run, the others as each begins.
-        return _Recording(reader.path, reader.about, runs[1:] or runs, in_sequence, last_ns)
+        about = reader.about
+    # Only now: what a flight recorder has of them may come after the first messages.
+    for track in tracks.values():
+        track.about = configurations.get(track.name, {})
+        track.sort_out(bool(about["deterministic"]))
+    in_sequence = sorted(tracks.values(), key=lambda track: track.about.get("sequence", -1))
+    if not runs:
+        runs.append((about["cycle"], about["epoch_ns"]))
+    return _Recording(reader.path, about, runs, in_sequence, last_ns)
 
 
 def _names(argument: str, names: Iterable[str] | None) -> frozenset[str] | None:

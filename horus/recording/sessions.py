@@ -56,7 +56,7 @@ def default_directory() -> Path:
     )
 
 
-def create(directory: Path, kind: str = "session") -> tuple[Path, int]:
+def create(directory: Path, kind: str = "session", suffix: str = SUFFIX) -> tuple[Path, int]:
     """Return the path of a new session's file, and its descriptor, which holds a lock.
 
     Raises:
@@ -67,7 +67,7 @@ def create(directory: Path, kind: str = "session") -> tuple[Path, int]:
     stem = f"{kind}_{moment:%Y_%m_%d_%H%M%S}"
     for number in range(1, 1000):
         name = stem if number == 1 else f"{stem}_{number}"
-        path = directory / f"{name}{SUFFIX}"
+        path = directory / f"{name}{suffix}"
         with contextlib.suppress(FileExistsError):
             descriptor = mcap_file.create(path)
             lock(descriptor)

@@ -84,7 +84,6 @@ def test_the_scheduler_of_the_contract_can_be_created():
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        ("blackbox_mb", 16),
         ("telemetry", "http://127.0.0.1:9/metrics"),
     ],
 )

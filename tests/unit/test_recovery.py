@@ -167,7 +167,7 @@ def test_any_bytes_are_read_or_refused(tmp_path, data, start):
     path = tmp_path / "any.mcap"
     head = tmp_path / "head"
     with head.open("w+b") as file:
-        mcap_file.begin(mcap_file.AppendedFile(file.fileno()), "test")
+        mcap_file.begin(mcap_file.AppendedFile(file.fileno()))
     begin = {"": b"", "magic": head.read_bytes()[:8], "head": head.read_bytes()}[start]
     for end in (b"", begin[:8]):
         path.write_bytes(begin + data + end)
