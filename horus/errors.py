@@ -126,10 +126,6 @@ class ConfigWarning(HorusWarning):
     """A configuration that is legal and probably not meant."""
 
 
-class UnavailableWarning(HorusWarning):
-    """A feature was asked for that this version does not provide."""
-
-
 def warn_user(message: str, category: type[HorusWarning]) -> None:
     """Warn at the line of the user's program that called into horus."""
     level = 2

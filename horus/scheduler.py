@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from horus import embedding, unavailable
+from horus import embedding
 from horus.core import NodeCore, core_of
 from horus.errors import ConfigError, StateError
 from horus.loop.realtime import capabilities
@@ -87,7 +87,10 @@ class Scheduler:
             cores: CPU cores to run on.
             max_deadline_misses: Stop after this many misses in all; None for no limit.
             verbose: Log at debug level and print the timing report after `run()`.
-            telemetry: Endpoint URL for metrics. Not in this version.
+            telemetry: Endpoint URL for metrics, every second: `http(s)://host/path` is sent
+                JSON, `otlp+http(s)://host:4318` OTLP/JSON; `file:///path.jsonl` grows by a
+                line; `prometheus://host:port` serves `/metrics`, on loopback if there is
+                no host.
             loop: The event loop of `run()`: `"uvloop"` or `"asyncio"`.
             shutdown_timeout: How long each node's shutdown may take [s].
             spin_us: How much early an Rt thread may wake up, to have the interpreter at
@@ -117,7 +120,6 @@ class Scheduler:
             spin_us=spin_us,
             seed=seed,
         )
-        unavailable.warn_of_scheduler(self._spec)
         self._session = Session(self._spec)
         self._registry = self._session.registry
         self._bus = self._session.bus
@@ -512,6 +514,15 @@ class Scheduler:
     def degradations(self) -> list[str]:
         """Return what was requested and refused, in readable sentences."""
         return self._session.oversight.real_time.degradations()
+
+    def metrics_text(self) -> str:
+        """Return all counters in Prometheus' text format, for an endpoint of your own.
+
+        Thread: any.
+        """
+        from horus.observe.metrics import prometheus_text
+
+        return prometheus_text([self._session.metrics().snapshot()])
 
     # -- recording -------------------------------------------------------------------
 

@@ -29,6 +29,8 @@ from horus.topics import Bus, Subscription
 from horus.units import to_s
 
 if TYPE_CHECKING:
+    from horus.observe.metrics import Metrics
+    from horus.observe.telemetry import Telemetry
     from horus.recording.recordings import Recordings
     from horus.recording.replay import Replays
 
@@ -85,6 +87,7 @@ class Session:
         self.pacer = Pacer()
         """Holds virtual time to real time, if asked to."""
         self._replays: Replays | None = None
+        self._telemetry: Telemetry | None = None
 
     @property
     def open(self) -> bool:
@@ -271,6 +274,29 @@ class Session:
 
         return Recordings(self._spec, self.timeline, self.bus)
 
+    # -- metrics -------------------------------------------------------------------------
+
+    def metrics(self) -> Metrics:
+        """Return what takes snapshots of the counters."""
+        from horus.observe.metrics import Metrics
+
+        safety = self.oversight.safety
+        return Metrics(
+            self._spec,
+            self.timeline,
+            self.registry,
+            self.bus,
+            lambda: safety.reason,
+            self.reporting_ns,
+        )
+
+    def _start_telemetry(self) -> None:
+        if self._spec.telemetry is not None:
+            from horus.observe.telemetry import Telemetry  # it loads an HTTP library
+
+            self._telemetry = Telemetry(self._spec.telemetry, self.metrics())
+            self._telemetry.start()
+
     # -- nodes that come, change and go ------------------------------------------------
 
     def joined(self, live: LiveNode) -> None:
@@ -366,6 +392,7 @@ class Session:
             self._replay_begins()
             if self._recordings is not None:
                 self._recordings.begin(self.registry.in_order)
+            self._start_telemetry()
 
     def _hand_back(self, *, keeps_open: bool) -> None:
         """Let others run the nodes; unless they stay initialised, they are shut down."""
@@ -401,6 +428,9 @@ class Session:
                 live.counters.end_span(live.period_ns)
             for stream in tuple(self._streams):
                 stream.close()
+            if self._telemetry is not None:
+                self._telemetry.stop()
+                self._telemetry = None
             if self._recordings is not None:
                 self._recordings.close(self.control.fault)
             clock.clear_ambient(self.timeline)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
+from horus.endpoint import Endpoint, parse_endpoint
 from horus.errors import ConfigError, ConfigWarning, warn_user
 from horus.timing import period_ns
 from horus.units import NS_PER_MS, NS_PER_S, NS_PER_US, readable
@@ -281,7 +282,7 @@ class SchedulerSpec:
     cores: tuple[int, ...] | None
     max_deadline_misses: int | None
     verbose: bool
-    telemetry: str | None
+    telemetry: Endpoint | None
     loop: str
     shutdown_timeout_ns: int
     spin_ns: int
@@ -314,8 +315,6 @@ def make_scheduler_spec(
     """
     if loop not in ("uvloop", "asyncio"):
         raise ConfigError("loop", loop, "must be 'uvloop' or 'asyncio'")
-    if telemetry is not None and (not isinstance(telemetry, str) or not telemetry):
-        raise ConfigError("telemetry", telemetry, "must be an endpoint URL")
     if recording_backpressure not in ("drop", "block"):
         raise ConfigError(
             "recording_backpressure", recording_backpressure, "must be 'drop' or 'block'"
@@ -336,7 +335,7 @@ def make_scheduler_spec(
         if max_deadline_misses is None
         else check_count("max_deadline_misses", max_deadline_misses, least=1),
         verbose=check_flag("verbose", verbose),
-        telemetry=telemetry,
+        telemetry=parse_endpoint(telemetry),
         loop=loop,
         shutdown_timeout_ns=check_duration("shutdown_timeout", shutdown_timeout),
         spin_ns=_spin_ns(spin_us, rt),

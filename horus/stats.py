@@ -82,14 +82,19 @@ def _bucket(duration_ns: int) -> int:
 
 
 def _quantile_ns(buckets: dict[int, int], fraction: float) -> int:
-    counts = sorted(buckets.copy().items())  # a copy: the node goes on ticking
-    wanted = fraction * sum(count for _, count in counts)
-    seen = 0
-    for bucket, count in counts:
-        seen += count
-        if seen >= wanted:
-            return _upper_edge_ns(bucket)
-    return 0
+    counts = buckets.copy()  # the node goes on ticking
+    if not counts:
+        return 0
+    total = sum(counts.values())
+    wanted = fraction * total
+    # From above, where a high quantile is soon found: telemetry asks for many.
+    found, at_most = 0, total
+    for bucket in sorted(counts, reverse=True):
+        if at_most < wanted:
+            break
+        found = bucket
+        at_most -= counts[bucket]
+    return _upper_edge_ns(found)
 
 
 def _upper_edge_ns(index: int) -> int:

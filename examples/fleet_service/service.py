@@ -17,7 +17,6 @@ from aiohttp import web
 
 from horus import ConfigError, Scheduler, TopicError, UnknownNodeError
 from horus.stream import MessageStream
-from metrics import metrics_text
 
 SCHEDULER = web.AppKey("scheduler", Scheduler)
 STREAMS = web.AppKey("streams", set[MessageStream])
@@ -127,8 +126,8 @@ async def stream_topic(request: web.Request) -> web.StreamResponse:
 @routes.get("/metrics")
 async def metrics(request: web.Request) -> web.Response:
     """Counters of nodes and topics for Prometheus."""
-    text = metrics_text(request.app[SCHEDULER])
-    return web.Response(body=text, headers={"Content-Type": "text/plain; version=0.0.4"})
+    text = request.app[SCHEDULER].metrics_text()
+    return web.Response(text=text, headers={"Content-Type": "text/plain; version=0.0.4"})
 
 
 async def next_event(messages: MessageStream) -> bytes | None:

@@ -16,7 +16,6 @@ from horus import (
     NodeError,
     Scheduler,
     StateError,
-    UnavailableWarning,
     ms,
     us,
 )
@@ -69,28 +68,15 @@ def test_all_configuration_happens_through_keyword_arguments():
 
 
 def test_the_scheduler_of_the_contract_can_be_created():
-    """Creating a Scheduler as the contract shows; what is not there yet says so."""
-    with pytest.warns(UnavailableWarning):
-        sched = Scheduler(
-            tick_rate=1000.0,
-            rt=True,
-            watchdog_ms=500,
-            blackbox_mb=16,
-            max_deadline_misses=50,
-        )
+    """Creating a Scheduler as the contract shows."""
+    sched = Scheduler(
+        tick_rate=1000.0,
+        rt=True,
+        watchdog_ms=500,
+        blackbox_mb=16,
+        max_deadline_misses=50,
+    )
     assert sched.status() == "idle"
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("telemetry", "http://127.0.0.1:9/metrics"),
-    ],
-)
-def test_an_argument_whose_work_is_not_there_yet_says_so_plainly(option, value):
-    """Nothing pretends: an argument without effect in this version warns and names itself."""
-    with pytest.warns(UnavailableWarning, match=option):
-        Scheduler(**{option: value})
 
 
 def test_full_rt_is_true_when_nothing_was_requested():

@@ -70,10 +70,10 @@ def test_the_robot_is_seen_and_told_over_http(service):
 
             async with client.get("/metrics") as answer:
                 metrics = await answer.text()
-            ticks = re.search(r'^horus_node_ticks_total\{node="drive"\} (\S+)$', metrics, re.M)
+            ticks = re.search(r'^horus_node_ticks_total\{node="drive",.*\} (\S+)$', metrics, re.M)
             assert ticks is not None
             assert float(ticks[1]) > 20
-            assert 'horus_node_healthy{node="battery"} 1.0' in metrics
+            assert 'horus_node_healthy{node="battery",scheduler="cart"} 1.0' in metrics
 
     asyncio.run(main())
 

@@ -13,7 +13,7 @@ ROOT = Path(horus.__file__).parent
 
 LAYERS = [
     ["units", "errors"],
-    ["timing", "validation", "os_rt"],
+    ["timing", "validation", "os_rt", "endpoint"],
     ["ports", "callables", "spec", "stats", "ratelimit"],
     ["clock", "logs", "snapshot", "standing"],
     ["topics", "graph", "escalation", "stream", "reports"],
@@ -23,7 +23,8 @@ LAYERS = [
     ["loop"],
     ["workers"],
     ["executors"],
-    ["registry", "unavailable", "drivers", "recording"],
+    ["registry", "drivers", "recording"],
+    ["observe"],
     ["oversight"],
     ["session"],
     ["embedding"],
@@ -101,7 +102,6 @@ def test_public_names() -> None:
         "Sub",
         "TimingReport",
         "TopicError",
-        "UnavailableWarning",
         "UnknownNodeError",
         "WorkerDied",
         "WorkerError",

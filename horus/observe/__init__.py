@@ -1,0 +1,1 @@
+"""Metrics of a scheduler, for applications and for telemetry endpoints."""
