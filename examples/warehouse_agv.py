@@ -44,7 +44,16 @@ from agv.devices import CameraNode, LidarNode
 from agv.fleet import FleetServer
 from agv.grid import OccupancyGrid
 from agv.layout import GOAL
-from agv.messages import MOUNTS, NEWEST_ODOM, NEWEST_SCANS, SCAN_TOPICS, Obstacles, Odometry
+from agv.messages import (
+    MOUNTS,
+    NEWEST_ODOM,
+    NEWEST_SCANS,
+    ODOM,
+    PATH,
+    SCAN_TOPICS,
+    Obstacles,
+    Odometry,
+)
 from agv.telemetry import BatteryWatcher, FleetUploader
 from agv.world import MAX_STEPS_PER_TICK, TIMESTEP_S, World
 from horus import Node, Scheduler, Sub, us
@@ -114,7 +123,7 @@ class PathPlanner(Node):
             order=50,
             compute=True,
             subs=[*NEWEST_SCANS, NEWEST_ODOM, Sub("obstacles", capacity=1)],
-            pubs=["path"],
+            pubs=[PATH],
         )
         self._grid, self._log = grid, log
         self._beams = {name: sensors.lidar_directions(mount) for name, mount in MOUNTS.items()}
@@ -159,7 +168,7 @@ class MotorController(Node):
                 "emergency.stop",
                 "emergency.clear",
             ],
-            pubs=["odom"],
+            pubs=[ODOM],
         )
         self._world, self._log = world, log
         self._drive = drive.Drive()

@@ -80,7 +80,7 @@ class NodeCore:
         self.disconnect()
         self._bus = bus
         for pub in self.pubs:
-            self.outputs[pub.topic] = bus.topic(pub.topic).publisher(self.spec.name)
+            self.outputs[pub.topic] = bus.topic(pub.topic).publisher(self.spec.name, pub.foxglove)
         for sub in self.subs:
             self.inputs[sub.topic] = bus.subscribe(sub.topic, self.spec.name, sub.capacity)
         on = self.spec.on

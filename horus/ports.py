@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from horus.errors import ConfigError
+from horus.foxglove import Declaration, check_declaration
 from horus.validation import check_topic, is_int
 
 DEFAULT_CAPACITY = 1024
@@ -35,10 +36,25 @@ class _Port:
             raise ConfigError("capacity", self.capacity, "must be a whole number of messages >= 1")
 
 
+@dataclass(frozen=True, slots=True)
 class Pub(_Port):
     """Declares a topic that a node publishes, e.g. `Pub("scan", LaserScan)`."""
 
+    foxglove: Declaration | None = field(default=None, kw_only=True)
 
+    def __post_init__(self) -> None:
+        """Refuse bad names, types, capacities and declarations.
+
+        Raises:
+            TopicError: The topic name is not usable.
+            ConfigError: The type is no class, the capacity is no whole number above 0, or
+                `foxglove` is none of `horus.foxglove`'s declarations.
+        """
+        _Port.__post_init__(self)
+        check_declaration(self.foxglove)
+
+
+@dataclass(frozen=True, slots=True)
 class Sub(_Port):
     """Declares a topic that a node receives; `Sub(topic, capacity=1)` keeps the latest only."""
 

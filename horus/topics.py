@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from horus.errors import ConfigError, TopicError, describe
+from horus.foxglove import Declaration
 from horus.ports import DEFAULT_CAPACITY
 from horus.snapshot import Frozen, UnsendableError, freeze
 from horus.validation import check_topic
@@ -142,12 +143,13 @@ class Publisher:
     Thread: one sender at a time (a node never overlaps itself).
     """
 
-    __slots__ = ("owner", "sent", "topic")
+    __slots__ = ("foxglove", "owner", "sent", "topic")
 
-    def __init__(self, topic: Topic, owner: str) -> None:
-        """Bind a sender to a topic."""
+    def __init__(self, topic: Topic, owner: str, foxglove: Declaration | None = None) -> None:
+        """Bind a sender to a topic; `foxglove` is how viewers are to show what it sends."""
         self.topic = topic
         self.owner = owner
+        self.foxglove = foxglove
         self.sent = 0
 
     def send(self, message: Any) -> None:
@@ -271,16 +273,16 @@ class Topic:
             return False
         return isinstance(message, self._accepted)
 
-    def publisher(self, owner: str) -> Publisher:
+    def publisher(self, owner: str, foxglove: Declaration | None = None) -> Publisher:
         """Return a new sender's end."""
         with self._lock:
-            publisher = self.make_publisher(owner)
+            publisher = self.make_publisher(owner, foxglove)
             self.publishers = (*self.publishers, publisher)
             return publisher
 
-    def make_publisher(self, owner: str) -> Publisher:
+    def make_publisher(self, owner: str, foxglove: Declaration | None = None) -> Publisher:
         """Return a sender's end that counts for nothing yet."""
-        return Publisher(self, owner)
+        return Publisher(self, owner, foxglove)
 
     def retire(self, publisher: Publisher) -> None:
         """Take a sender's end away; unknown ones are ignored."""

@@ -8,7 +8,7 @@ import numpy as np
 
 import horus
 from agv import sensors
-from agv.messages import MOUNTS, SCAN_TOPICS, Obstacles
+from agv.messages import MOUNTS, OBSTACLES, SCAN_TOPICS, SCANS, Obstacles
 from agv.mission import DISCONNECTED, MissionLog
 from horus import Node
 
@@ -23,7 +23,7 @@ class LidarNode(Node):
 
     def __init__(self, side: str, order: int, world: World, log: MissionLog) -> None:
         """Serve the LiDAR of a side, "front" or "rear"."""
-        super().__init__(f"lidar_{side}", rate=40, order=order, pubs=[SCAN_TOPICS[side]])
+        super().__init__(f"lidar_{side}", rate=40, order=order, pubs=[SCANS[side]])
         self._side, self._world, self._log = side, world, log
         self._lidar: sensors.Lidar | None = None
 
@@ -50,7 +50,7 @@ class CameraNode(Node):
 
     def __init__(self, world: World, log: MissionLog) -> None:
         """Look into a world; note the disconnection in a log."""
-        super().__init__("camera", rate=10, order=20, pubs=["obstacles"])
+        super().__init__("camera", rate=10, order=20, pubs=[OBSTACLES])
         self._world, self._log = world, log
         self._pipeline = sensors.CameraPipeline()
         self._camera: sensors.DepthCamera | None = None

@@ -17,6 +17,7 @@ from agv import layout
 from agv.world import GROUP_BUILDING, GROUP_FLOOR, GROUP_GOODS, Snapshot
 
 MAX_RANGE_M = 12.0
+LIDAR_HALF_FOV_RAD = math.radians(120.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,8 +118,7 @@ class RayBundle:
 
 def lidar_directions(mount: Mount) -> np.ndarray:
     """Return one unit vector per beam, (180, 3) float64, in the vehicle's axes: 240 degrees."""
-    half_fov = math.radians(120.0)
-    angles = mount.yaw_rad + np.linspace(-half_fov, half_fov, 180)
+    angles = mount.yaw_rad + np.linspace(-LIDAR_HALF_FOV_RAD, LIDAR_HALF_FOV_RAD, 180)
     return np.column_stack((np.cos(angles), np.sin(angles), np.zeros_like(angles)))
 
 

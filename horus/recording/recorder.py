@@ -321,7 +321,7 @@ class Recorder:
         for topic, reason in self._scribe.refused.items():
             if topic not in self._told_of:
                 self._told_of.add(topic)
-                _log.error("messages of topic %r are not recorded: %s", topic, reason)
+                _log.error("messages of topic %r %s", topic, reason)
         lost, self._told_lost = self._lost - self._told_lost, self._lost
         if lost:
             text = f"{lost} items were lost, because writing does not keep up"

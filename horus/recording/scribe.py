@@ -3,6 +3,7 @@
 | channel | encoding | what |
 | --- | --- | --- |
 | the topic's name, one channel for each publisher | `horus.msgpack` | every message, exactly |
+| `foxglove/TOPIC`, likewise, if its `Pub` declares it | JSON, `foxglove.*` | the same for viewers |
 | `horus/ticks/NODE` | JSON | every tick |
 | `horus/log` | JSON, `foxglove.Log` | every log record |
 | `horus/events` | JSON | what changes: health, states, runs, losses |
@@ -23,10 +24,10 @@ import msgspec
 from mcap.records import Channel, Schema
 
 from horus.clock import NEVER
+from horus.foxglove import DECLARATIONS, LOG_SCHEMA, Declaration, object_schema, timestamp
 from horus.recording.encoding import UnrecordableError, encode, name_of
 from horus.snapshot import Frozen
 from horus.topics import Publisher
-from horus.units import NS_PER_S
 
 FORMAT = "1"
 """Version of the format; a reader refuses those that it does not know."""
@@ -97,15 +98,8 @@ class Writer(Protocol):
         """Take a message; the times are wall times [ns]."""
 
 
-def _schema(**fields: str | Mapping[str, Any]) -> Mapping[str, Any]:
-    kinds = {
-        name: {"type": kind} if isinstance(kind, str) else kind for name, kind in fields.items()
-    }
-    return {"type": "object", "properties": kinds, "required": list(kinds)}
-
-
 SCHEMAS: Mapping[str, Mapping[str, Any]] = {
-    "horus.Tick": _schema(
+    "horus.Tick": object_schema(
         cycle="integer",
         release_ns="integer",
         start_latency_us="number",
@@ -114,18 +108,11 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = {
         past_deadline_us="number",
         failed="boolean",
     ),
-    "horus.Event": _schema(kind="string", node="string", text="string"),
+    "horus.Event": object_schema(kind="string", node="string", text="string"),
     "horus.Node": {"type": "object", "properties": {"name": {"type": "string"}}},
     "horus.Scheduler": {"type": "object", "properties": {"format": {"type": "string"}}},
-    # https://docs.foxglove.dev/docs/visualization/message-schemas/log
-    "foxglove.Log": _schema(
-        timestamp=_schema(sec="integer", nsec="integer"),
-        level="integer",
-        message="string",
-        name="string",
-        file="string",
-        line="integer",
-    ),
+    "foxglove.Log": LOG_SCHEMA,
+    **{kind.schema_name: kind.schema for kind in DECLARATIONS},
 }
 _SCHEMA_OF_CHANNEL = {
     "horus/events": "horus.Event",
@@ -150,7 +137,7 @@ class Scribe:
         self._of_publisher: dict[Publisher, int] = {}
         self._of_node: dict[str, int] = {}
         self.refused: dict[str, str] = {}
-        """What cannot be recorded, by topic."""
+        """What is not written as it should be, and why, by topic."""
 
     def write(self, item: Item) -> None:
         """Write one item."""
@@ -179,16 +166,36 @@ class Scribe:
             channel = self._of_publisher[publisher] = self._open_topic(publisher)
         payload, thaw = frozen
         try:
-            data = encode(payload if thaw is None else thaw(payload))
+            message = payload if thaw is None else thaw(payload)
+            data = encode(message)
         except Exception as exc:  # also of the code of a message's own class
             reason = str(exc) if isinstance(exc, UnrecordableError) else f"{exc!r}"
-            self.refused.setdefault(publisher.topic.name, reason)
+            self.refused.setdefault(publisher.topic.name, f"are not recorded: {reason}")
             return
         offset_ns = self._offset_ns
         release_ns = OUTSIDE if release_ns == NEVER else release_ns + offset_ns
         envelope = ENVELOPE.pack(_ARRAY_OF_3, _INT64, cycle, _INT64, release_ns)
         sent_ns += offset_ns
         self._writer.add_message(channel, sequence, sent_ns, sent_ns, envelope + data)
+        if publisher.foxglove is not None:
+            self._write_for_viewers(publisher, publisher.foxglove, sequence, sent_ns, message)
+
+    def _write_for_viewers(
+        self,
+        publisher: Publisher,
+        declaration: Declaration,
+        sequence: int,
+        wall_ns: int,
+        message: Any,
+    ) -> None:
+        topic, schema = publisher.topic.name, declaration.schema_name
+        try:
+            data = _json(declaration.converted(message, wall_ns))
+        except Exception as exc:  # also of the application's own callables
+            self.refused.setdefault(topic, f"are not shown as {schema}: {exc}")
+            return
+        channel = self._open(f"foxglove/{topic}", schema, publisher.owner)
+        self._writer.add_message(channel, sequence, wall_ns, wall_ns, data)
 
     def _write_tick(
         self,
@@ -220,10 +227,9 @@ class Scribe:
 
     def _write_log(self, at_ns: int, record: logging.LogRecord, text: str) -> None:
         at_ns += self._offset_ns
-        seconds, rest_ns = divmod(at_ns, NS_PER_S)
         data = _json(
             {
-                "timestamp": {"sec": seconds, "nsec": rest_ns},
+                "timestamp": timestamp(at_ns),
                 "level": next((to for least, to in _FOXGLOVE_LEVELS if record.levelno >= least), 0),
                 "message": text,
                 "name": record.name,
@@ -245,15 +251,16 @@ class Scribe:
             metadata["type"] = name_of(topic.type)
         return self._define(topic.name, publisher.owner, EXACT, 0, metadata)
 
-    def _open(self, name: str, schema: str) -> int:
-        number = self._channels.get((name, ""))
+    def _open(self, name: str, schema: str, publisher: str = "") -> int:
+        number = self._channels.get((name, publisher))
         if number is not None:
             return number
         if schema not in self._schemas:
             self._schemas[schema] = len(self._schemas) + 1
             data = _json(SCHEMAS[schema])
             self._writer.define(Schema(self._schemas[schema], data, "jsonschema", schema))
-        return self._define(name, "", "json", self._schemas[schema], {})
+        metadata = {"publisher": publisher} if publisher else {}
+        return self._define(name, publisher, "json", self._schemas[schema], metadata)
 
     def _define(
         self, name: str, publisher: str, encoding: str, schema: int, metadata: dict[str, str]

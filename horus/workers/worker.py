@@ -25,6 +25,7 @@ from horus import clock, os_rt
 from horus.clock import MonotonicClock, TickContext, Timeline
 from horus.core import core_of
 from horus.errors import StateError, TopicError
+from horus.foxglove import Declaration
 from horus.snapshot import Frozen
 from horus.stats import NodeCounters
 from horus.topics import Bus, Publisher, Subscription, Topic
@@ -201,7 +202,8 @@ class _RemoteTopic(Topic):
         super().__init__(name, lock)
         self._worker = worker
 
-    def make_publisher(self, owner: str) -> Publisher:
+    def make_publisher(self, owner: str, foxglove: Declaration | None = None) -> Publisher:
+        # How it is shown is the scheduler's business, which records.
         return _RemotePublisher(self, owner, self._worker)
 
 

@@ -13,7 +13,7 @@ ROOT = Path(horus.__file__).parent
 
 LAYERS = [
     ["units", "errors"],
-    ["timing", "validation", "os_rt", "endpoint"],
+    ["timing", "validation", "os_rt", "endpoint", "foxglove"],
     ["ports", "callables", "spec", "stats", "ratelimit"],
     ["clock", "logs", "snapshot", "standing"],
     ["topics", "graph", "escalation", "stream", "reports"],
