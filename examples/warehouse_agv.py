@@ -152,8 +152,10 @@ class MotorController(Node):
     The one thread that may touch the world's state is this node's.
     """
 
-    def __init__(self, world: World, log: mission.MissionLog) -> None:
-        """Own a world; note what happens in a log."""
+    def __init__(
+        self, world: World, log: mission.MissionLog, vehicle: drive.Drive | None = None
+    ) -> None:
+        """Own a world; note what happens in a log; drive another drive than the usual one."""
         # on_miss="safe_mode" would brake at every late tick of an ordinary kernel; see safety.
         super().__init__(
             "motor",
@@ -171,7 +173,7 @@ class MotorController(Node):
             pubs=[ODOM],
         )
         self._world, self._log = world, log
-        self._drive = drive.Drive()
+        self._drive = vehicle or drive.Drive()
         self._ticks = 0
         self._braking = False
 

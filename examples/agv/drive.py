@@ -42,10 +42,11 @@ class Drive:
     Thread: the motor controller's.
     """
 
-    def __init__(self) -> None:
-        """Stand, and wait for a path."""
+    def __init__(self, acceleration_mps2: float = ACCELERATION_MPS2) -> None:
+        """Stand, and wait for a path; speed up and slow down at most so much [m/s²]."""
         self.state = DriveState.WAITING
         self.speed_limit_mps = CRUISE_MPS
+        self._acceleration_mps2 = acceleration_mps2
         self._path: list[list[float]] = []
         self._nearest = 0
         self._turning = False
@@ -105,7 +106,7 @@ class Drive:
         """Move the commanded speeds toward the wanted ones; return left and right [rad/s]."""
         emergency = self.state is DriveState.EMERGENCY
         speed, turn = (0.0, 0.0) if emergency else self._wanted
-        speed_step = dt_s * (EMERGENCY_MPS2 if emergency else ACCELERATION_MPS2)
+        speed_step = dt_s * (EMERGENCY_MPS2 if emergency else self._acceleration_mps2)
         turn_step = dt_s * TURN_ACCELERATION_RADPS2
         self._speed += max(-speed_step, min(speed - self._speed, speed_step))
         self._turn += max(-turn_step, min(turn - self._turn, turn_step))
