@@ -171,7 +171,7 @@ class Recorder:
                     past_deadline_ns,
                     failed,
                 ),
-                "",
+                node,
             )
 
         return note_tick

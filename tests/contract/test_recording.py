@@ -477,7 +477,7 @@ _KILLED = """
             import ctypes
             ctypes.string_at(0)
     sched = Scheduler(tick_rate=1000, recording=sys.argv[1])
-    sched.add(Node("count", tick, rate=1000, rt=False, pubs=["count"]))
+    sched.add(Node("count", tick, rate=1000, pubs=["count"]))
     sched.run(duration=30)
 """
 
@@ -485,7 +485,7 @@ _KILLED = """
 @pytest.mark.parametrize("how", ["kill", "segfault"])
 def test_a_process_that_dies_leaves_what_is_older_than_200_ms(how, tmp_path):
     """After SIGKILL or a segfault, everything sent more than 200 ms before is salvaged."""
-    script = textwrap.dedent(_KILLED).replace(", rt=False", "")
+    script = textwrap.dedent(_KILLED)
     run = subprocess.run(
         [sys.executable, "-c", script, str(tmp_path), how],
         capture_output=True,

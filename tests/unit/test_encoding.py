@@ -11,6 +11,7 @@ import fractions
 import math
 import pathlib
 import pickle
+import tempfile
 import uuid
 import zoneinfo
 from typing import Any, NamedTuple
@@ -18,10 +19,11 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from horus import Node, Scheduler
 from horus.recording import encoding
 from horus.recording.encoding import UnrecordableError, decode, encode
 from horus.snapshot import freeze
@@ -146,6 +148,32 @@ def test_what_the_bus_accepts_can_be_recorded(message: Any) -> None:
         return
     payload, thaw = freeze(message)
     assert same(decode(encode(payload if thaw is None else thaw(payload))), message)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(MESSAGES.filter(lambda message: message is not None), min_size=1, max_size=5))
+def test_messages_survive_record_and_replay(messages: list[Any]) -> None:
+    """A node that is live again receives from a stand-in exactly what the bus had accepted."""
+    received: list[Any] = []
+
+    def send(node: Node) -> None:
+        for message in messages:
+            node.send("topic", message)
+
+    def receive(node: Node) -> None:
+        received.extend(node.recv_all("topic"))
+
+    with tempfile.TemporaryDirectory() as directory:
+        sched = Scheduler(tick_rate=10, recording=directory, deterministic=True)
+        sched.add(Node("sender", send, rate=10, order=0, pubs=["topic"]))
+        sched.tick_once()
+        (path,) = sched.stop_recording()
+        sched.stop()
+        replayed = Scheduler.replay_from(path, classes=[Plain])
+        replayed.set_replay_speed(math.inf)
+        replayed.add(Node("receiver", receive, rate=10, order=1, subs=["topic"]))
+        replayed.run()
+    assert same(received, messages)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,253 @@
+"""The queue between ticks and the thread that writes: bounded, in order, honest about losses."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+from mcap.records import Chunk
+
+from horus import Node, RecordingReader, Scheduler
+from horus.clock import MonotonicClock, SimClock, Timeline
+from horus.recording import recorder as module
+from horus.recording.encoding import decode
+from horus.recording.mcap_file import Index, packed
+from horus.recording.reader import RECORD_HEAD, Entry, entries_of, unpack
+from horus.recording.recorder import Recorder
+from horus.recording.scribe import ENVELOPE
+from horus.recording.session_file import SessionFile
+from horus.topics import Bus
+
+ROOM = 100
+"""Items that may wait in these tests."""
+PATIENCE_S = 10.0
+
+
+class Disk:
+    """A sink that can be made to stand still."""
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self.chunks: list[Chunk] = []
+        self.flows = threading.Event()
+        self.flows.set()
+        self.reached = threading.Event()
+        self.closed = False
+
+    def write(self, chunk: Chunk, index: Index) -> int:
+        self.reached.set()
+        assert self.flows.wait(PATIENCE_S)
+        self.chunks.append(chunk)
+        return len(chunk.data)
+
+    def sync(self) -> None: ...
+
+    def finish(self) -> None: ...
+
+    def close(self) -> None:
+        self.closed = True
+
+    def entries(self) -> Iterator[Entry]:
+        for chunk in self.chunks:
+            _, data = unpack(packed(chunk)[RECORD_HEAD.size :])
+            yield from entries_of(data)
+
+    def messages(self) -> list[int]:
+        return [
+            decode(bytes(entry.data[ENVELOPE.size :]))
+            for entry in self.entries()
+            if entry.channel.topic == "count"
+        ]
+
+    def losses(self) -> list[str]:
+        events = [
+            json.loads(bytes(e.data)) for e in self.entries() if e.channel.topic == "horus/events"
+        ]
+        return [event["text"] for event in events if event["kind"] == "lost"]
+
+
+class Rig:
+    """A recorder between a bus and a disk."""
+
+    def __init__(self, timeline: Timeline) -> None:
+        self.disk = Disk()
+        self.recorder = Recorder(timeline, {"name": "rig"}, flush_ns=0)
+        self.recorder.start([self.disk])
+        bus = Bus()
+        bus.add_tap(self.recorder.note_message)
+        self._publisher = bus.topic("count").publisher("node")
+
+    def send(self, count: int) -> None:
+        for _ in range(count):
+            self._publisher.send(self._publisher.sent + 1)
+
+    def stall(self) -> None:
+        """Have the writer stand in the middle of writing, with an empty queue behind it."""
+        self.disk.flows.clear()
+        self.disk.reached.clear()
+        self.send(1)
+        assert self.disk.reached.wait(PATIENCE_S)
+
+    def finish(self) -> None:
+        self.disk.flows.set()
+        self.recorder.finish()
+
+
+@pytest.fixture
+def live(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    monkeypatch.setattr(module, "MOST_UNWRITTEN", ROOM)
+    rig = Rig(Timeline(MonotonicClock(), 100))
+    yield rig
+    rig.finish()
+
+
+@pytest.fixture
+def simulated(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    monkeypatch.setattr(module, "MOST_UNWRITTEN", ROOM)
+    rig = Rig(Timeline(SimClock(), 100, seed=0))
+    yield rig
+    rig.finish()
+
+
+def test_what_finds_no_room_is_counted_recorded_and_logged(
+    live: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The oldest are kept in order, the others are lost, and file and log say how many."""
+    live.stall()
+    live.send(5 * ROOM)
+    assert live.recorder.lost == 4 * ROOM
+    live.finish()
+    assert live.disk.messages() == list(range(1, ROOM + 2))
+    assert live.disk.losses() == ["400 items were lost, because writing does not keep up"]
+    told = [record for record in caplog.records if "were lost" in record.getMessage()]
+    assert len(told) == 1
+    assert live.disk.closed
+
+
+def test_sending_never_waits_for_the_disk(live: Rig) -> None:
+    """A sender is not held up, however long the disk stands still."""
+    live.stall()
+    began = time.monotonic()
+    live.send(1000)
+    assert time.monotonic() - began < 1.0
+
+
+def test_a_disk_that_stands_still_too_long_costs_new_messages_though_there_is_room(
+    live: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Large messages would fill the memory before they are many."""
+    monkeypatch.setattr(module, "_LONGEST_STALL_NS", 50_000_000)
+    live.stall()
+    time.sleep(0.2)
+    live.send(3)
+    assert live.recorder.lost == 3
+    live.disk.flows.set()
+    for _ in range(2):  # the second one is done after the writer has come to the end of its queue
+        live.recorder.do(lambda: None)
+    live.send(2)
+    live.finish()
+    assert live.recorder.lost == 3
+    assert live.disk.messages() == [1, 5, 6]
+
+
+def test_virtual_time_waits_for_the_disk(simulated: Rig) -> None:
+    """In virtual time nothing is lost: the sender waits until there is room."""
+    simulated.stall()
+    sender = threading.Thread(target=simulated.send, args=[5 * ROOM])
+    sender.start()
+    sender.join(0.2)
+    assert sender.is_alive()
+    simulated.disk.flows.set()
+    sender.join(PATIENCE_S)
+    assert not sender.is_alive()
+    simulated.finish()
+    assert simulated.recorder.lost == 0
+    assert simulated.disk.messages() == list(range(1, 5 * ROOM + 2))
+
+
+def test_a_sender_does_not_wait_for_a_recorder_that_has_ended(simulated: Rig) -> None:
+    """Whoever waits for room is released when recording ends."""
+    simulated.stall()
+    sender = threading.Thread(target=simulated.send, args=[5 * ROOM])
+    sender.start()
+    simulated.finish()
+    sender.join(PATIENCE_S)
+    assert not sender.is_alive()
+
+
+def test_the_end_does_not_wait_for_ever(
+    live: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A disk that stands still at the end of the run holds it up for a bounded time."""
+    monkeypatch.setattr(module, "_FINISH_TIMEOUT_S", 0.1)
+    live.stall()
+    began = time.monotonic()
+    live.recorder.finish()
+    assert time.monotonic() - began < 2.0
+    assert "the session is unfinished" in caplog.text
+
+
+def test_work_for_the_writer_is_done_after_what_came_before_it(live: Rig) -> None:
+    """What `do` does sees everything that was sent until then; its error is the caller's."""
+    live.send(10)
+    assert live.recorder.do(live.disk.messages) == list(range(1, 11))
+
+    def fail() -> None:
+        raise OSError("no space")
+
+    with pytest.raises(OSError, match="no space"):
+        live.recorder.do(fail)
+    live.stall()
+    with pytest.raises(TimeoutError):
+        live.recorder.do(live.disk.messages, timeout_s=0.05)
+
+
+@pytest.mark.parametrize(("rate", "waits"), [(None, True), (50, False)], ids=["BestEffort", "Rt"])
+def test_backpressure_is_for_best_effort_nodes_only(rate, waits, tmp_path, monkeypatch) -> None:
+    """With `"block"` a BestEffort node waits and loses nothing; an Rt node never waits."""
+    monkeypatch.setattr(module, "MOST_UNWRITTEN", ROOM)
+    write = SessionFile.write
+    stalled_s = 0.3
+
+    def write_slowly(self, chunk, index):
+        if blocked.is_set():
+            time.sleep(stalled_s)
+        return write(self, chunk, index)
+
+    monkeypatch.setattr(SessionFile, "write", write_slowly)
+    blocked = threading.Event()
+    took_s = []
+
+    def tick(node):
+        if took_s:
+            return
+        blocked.set()
+        node.send("count", 0)
+        time.sleep(0.2)  # until the writer is at it
+        blocked.clear()
+        began = time.monotonic()
+        for count in range(1, 3 * ROOM):
+            node.send("count", count)
+        took_s.append(time.monotonic() - began)
+        node.request_stop()
+
+    sched = Scheduler(recording=tmp_path, recording_backpressure="block")
+    sched.add(Node("it", tick, rate=rate, pubs=["count"], watchdog=5.0))
+    sched.run(duration=5.0)
+    (path,) = sched.stop_recording()
+    with RecordingReader(path) as reader:
+        counts = [recorded.message() for recorded in reader.messages(["count"])]
+        losses = [fact for fact in reader.facts("horus/events") if fact["kind"] == "lost"]
+        ticks = list(reader.facts("horus/ticks/it"))
+    if waits:
+        # What supervision logs about the long tick comes from a thread that never waits.
+        assert counts == list(range(3 * ROOM))
+        assert len(ticks) == sched.get_node_stats("it")["total_ticks"]
+    else:
+        assert counts == list(range(len(counts)))
+        assert len(counts) < 3 * ROOM
+        assert took_s[0] < stalled_s / 2
+        assert losses
