@@ -33,6 +33,7 @@ bench: .venv/dev
 	$(BIN)/python -m benchmarks micro --peers
 	$(BIN)/python -m benchmarks agv --peers --plot agv.bench.png
 	$(BIN)/python -m benchmarks service --peers
+	$(BIN)/python -m benchmarks recording --peers
 
 clean:
 	rm -rf .venv .bench site .mypy_cache .pytest_cache .ruff_cache .hypothesis

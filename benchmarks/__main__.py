@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 BENCHMARKS = {
     "micro": "topics, scheduler overhead, event latency, CPU load and import time",
     "agv": "the warehouse AGV: does the motor keep its 1 kHz beside a busy planner?",
+    "recording": "what recording, replay, recovery and telemetry cost, and whether a message is lost",
     "service": "off the interpreter, inside your service: worker processes and embedding",
 }
 """Benchmark name (a module of this package with ``main(argv) -> int``) to its one-line summary."""
@@ -21,7 +22,7 @@ BENCHMARKS = {
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Split the command line into the benchmark's name and the arguments meant for it."""
-    summaries = "\n".join(f"  {name:<8} {summary}" for name, summary in BENCHMARKS.items())
+    summaries = "\n".join(f"  {name:<9} {summary}" for name, summary in BENCHMARKS.items())
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks",
         description=f"Run one benchmark.\n\nbenchmarks:\n{summaries}",

@@ -52,7 +52,11 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     count = harness.at_least_one
     parser.add_argument(
-        "--seconds", type=_positive, default=5.0, metavar="N", help="length of a run, default 5"
+        "--seconds",
+        type=harness.positive,
+        default=5.0,
+        metavar="N",
+        help="length of a run, default 5",
     )
     parser.add_argument("--rounds", type=count, default=3, metavar="N", help="default 3")
     parser.add_argument(
@@ -73,7 +77,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--soak",
-        type=_positive,
+        type=harness.positive,
         metavar="MINUTES",
         help="instead of everything else, run a healthy schedule under a watchdog for so long",
     )
@@ -91,13 +95,6 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="draw the latency histograms, e.g. agv.bench.png",
     )
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be positive, not {text}")
-    return value
 
 
 def our_contender(seconds: float) -> Contender:

@@ -95,6 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("name", help="the workload that it runs beside")
     parser.add_argument("--seconds", type=float, required=True)
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    parser.add_argument("--quick", action="store_true", help="changes nothing: --seconds does")
     options = parser.parse_args(argv)
     executable = find()
     if executable is None:

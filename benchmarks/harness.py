@@ -80,6 +80,13 @@ class Measure:
     statistic: Statistic
     target: Target | None = None
 
+    def figure(self, run: ChildRun) -> float | None:
+        """Return the figure of a run that delivered; None if its contender does not tell it."""
+        try:
+            return self.statistic(run.series)
+        except KeyError:
+            return None
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChildRun:
@@ -315,11 +322,12 @@ def _load(run: ChildRun) -> float:
 
 def summarize(runs: Sequence[ChildRun], measure: Measure, contender: str) -> Figure:
     """Reduce each round to one figure and return their median and range."""
-    figures = [
-        measure.statistic(run.series)
+    told = [
+        measure.figure(run)
         for run in runs
         if run.workload == measure.workload and run.contender == contender and run.error is None
     ]
+    figures = [figure for figure in told if figure is not None]
     if not figures:
         return Figure(median=math.nan, low=math.nan, high=math.nan)
     return Figure(median=statistics.median(figures), low=min(figures), high=max(figures))
@@ -341,7 +349,8 @@ def table_rows(
 ) -> list[tuple[str, ...]]:
     """Return the table's cells, header first; the first contender is the one held to the targets.
 
-    The ratio column, present when there is a second contender, is first divided by second.
+    The ratio column, present when there is a second contender, is first divided by second, or by
+    the next one that has the figure.
     """
     ratio = len(contenders) > 1
     header = (*HEADER, *contenders, *(("ratio",) if ratio else ()), "target", "met")
@@ -349,15 +358,21 @@ def table_rows(
     for measure in measures:
         figures = [summarize(runs, measure, contender) for contender in contenders]
         own = figures[0].median
-        ran = {run.contender for run in runs if run.workload == measure.workload}
+        taking_part = {
+            run.contender
+            for run in runs
+            if run.workload == measure.workload
+            and (run.error is not None or measure.figure(run) is not None)
+        }
         # A contender fails in what it takes part in only.
         shown = [
-            str(figure) if label == contenders[0] or label in ran else "-"
+            str(figure) if label == contenders[0] or label in taking_part else "-"
             for label, figure in zip(contenders, figures, strict=True)
         ]
         cells = [measure.title, measure.unit, *shown]
         if ratio:
-            other = figures[1].median
+            others = (each.median for each in figures[1:] if not math.isnan(each.median))
+            other = next(others, math.nan)
             comparable = not (math.isnan(own) or math.isnan(other) or other == 0)
             cells.append(format_number(own / other) if comparable else "-")
         target = measure.target
@@ -421,6 +436,14 @@ def at_least_one(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, not {value}")
+    return value
+
+
+def positive(text: str) -> float:
+    """Parse an option that is a length of time."""
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be positive, not {text}")
     return value
 
 

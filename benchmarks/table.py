@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 from benchmarks import harness, peers
@@ -15,6 +15,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from benchmarks.harness import ChildRun, Contender, Measure
+
+
+RUNS_IN_A_WORKLOAD = 4
+"""How often a workload may run for ``--seconds``, before it is given up."""
+QUICK_S = 1.0
+"""What stands in for ``--seconds`` with ``--quick`` [s]."""
 
 
 class FindContenders(Protocol):
@@ -28,6 +34,15 @@ class FindContenders(Protocol):
         """
 
 
+def lasting(contender: Contender, seconds: float) -> Contender:
+    """Return a contender whose children are told how long to run [s]."""
+    return replace(
+        contender,
+        arguments=(*contender.arguments, "--seconds", f"{seconds:g}"),
+        timeout_s=contender.timeout_s + RUNS_IN_A_WORKLOAD * seconds,
+    )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableBenchmark:
     """What is measured of whom, with the command that does it."""
@@ -39,6 +54,10 @@ class TableBenchmark:
     peers_help: str
     reading: str
     """How to read the table: which way is better."""
+    rounds: int = 5
+    """How many rounds unless ``--rounds`` says otherwise."""
+    seconds: float | None = None
+    """How long a run lasts unless ``--seconds`` says otherwise [s]; None if nobody can choose."""
 
     @property
     def workloads(self) -> tuple[str, ...]:
@@ -58,8 +77,18 @@ class TableBenchmark:
             "--quick", action="store_true", help="one short round: smoke, not figures"
         )
         parser.add_argument(
-            "--rounds", type=harness.at_least_one, metavar="N", help="default 5; 1 with --quick"
+            "--rounds",
+            type=harness.at_least_one,
+            metavar="N",
+            help=f"default {self.rounds}; 1 with --quick",
         )
+        if self.seconds is not None:
+            parser.add_argument(
+                "--seconds",
+                type=harness.positive,
+                metavar="N",
+                help=f"length of a run, default {self.seconds:g}; {QUICK_S:g} with --quick",
+            )
         parser.add_argument(
             "--calm",
             type=float,
@@ -78,7 +107,9 @@ class TableBenchmark:
         )
         options = parser.parse_args(argv)
         if options.rounds is None:
-            options.rounds = 1 if options.quick else 5
+            options.rounds = 1 if options.quick else self.rounds
+        if self.seconds is not None and options.seconds is None:
+            options.seconds = QUICK_S if options.quick else self.seconds
         return options
 
     def report(
@@ -113,6 +144,8 @@ class TableBenchmark:
         except peers.PeerError as error:
             print(error, file=sys.stderr)
             return 2
+        if self.seconds is not None:
+            contenders = [lasting(contender, options.seconds) for contender in contenders]
         runs = harness.run_rounds(
             contenders,
             options.only,

@@ -17,6 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from horus import Node, Scheduler
 from horus.errors import ConfigError
+from horus.observe import telemetry as module
 
 from .helpers import nothing
 
@@ -75,6 +76,12 @@ def make(telemetry, **options):
     sched.add(Node("lidar", lambda node: node.send("scan", 1), rate=100, pubs=["scan"]))
     sched.add(Node("arm", nothing, on="scan"))
     return sched
+
+
+@pytest.fixture
+def often(monkeypatch):
+    """Export five times a second."""
+    monkeypatch.setattr(module, "PERIOD_S", 0.2)
 
 
 def test_snapshots_are_posted_every_second():
@@ -150,9 +157,10 @@ def test_prometheus_is_served():
             url = f"http://127.0.0.1:{port}/metrics"
             with contextlib.suppress(OSError), urllib.request.urlopen(url, timeout=5) as page:
                 texts.append(page.read().decode())
+                node.request_stop()
 
     sched.add(Node("scrape", scrape, rate=5, compute=True))
-    sched.run(duration=2.0)
+    sched.run(duration=10.0)
     families = {family.name: family for family in text_string_to_metric_families(texts[0])}
     (sample,) = (
         sample
@@ -178,59 +186,59 @@ def test_a_port_that_is_taken_leaves_the_robot_running(caplog):
     assert len([r for r in caplog.records if "robot runs on" in r.getMessage()]) == 1
 
 
-def test_json_lines_are_appended(tmp_path):
+def test_json_lines_are_appended(often, tmp_path):
     """file://: one object a line; what was there stays."""
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"old": 1}\n')
-    make(f"file://{path}").run(duration=1.3)
+    make(f"file://{path}").run(duration=0.5)
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert lines[0] == {"old": 1}
     assert len(lines) >= 3
     assert lines[-1]["scheduler"] == "rover"
 
 
-def test_a_file_that_cannot_be_written_leaves_the_robot_running(tmp_path, caplog):
+def test_a_file_that_cannot_be_written_leaves_the_robot_running(often, tmp_path, caplog):
     """It is told once, and once more when it works again."""
     directory = tmp_path / "later"
     sched = make(f"file://{directory}/m.jsonl")
 
     def mend(node):
-        if sched.get_node_stats("lidar")["total_ticks"] == 130:
+        if sched.get_node_stats("lidar")["total_ticks"] >= 50:
             directory.mkdir(exist_ok=True)
 
     sched.add(Node("mend", mend, rate=100, order=200))
-    sched.run(duration=2.6)
+    sched.run(duration=1.0)
     told = [r.getMessage() for r in caplog.records if "telemetry to" in r.getMessage()]
     assert len(told) == 2
     assert "No such file" in told[0]
-    assert "works again; 2 snapshots were lost" in told[1]
+    assert re.search(r"works again; [1-9] snapshots were lost", told[1])
     assert (directory / "m.jsonl").read_text()
 
 
 @pytest.mark.parametrize("scheme", ["http", "otlp+http"])
-def test_a_dead_endpoint_costs_the_schedule_nothing(scheme, caplog):
+def test_a_dead_endpoint_costs_the_schedule_nothing(scheme, often, caplog):
     """Nobody listens: told once, and every tick is there."""
     sched = make(f"{scheme}://127.0.0.1:{free_port()}/x")
     began = time.monotonic()
-    sched.run(duration=2.0)
-    assert time.monotonic() - began < 5.0
-    assert sched.get_node_stats("lidar")["total_ticks"] >= 150
+    sched.run(duration=0.8)
+    assert time.monotonic() - began < 4.0
+    assert sched.get_node_stats("lidar")["total_ticks"] >= 60
     assert len([r for r in caplog.records if "robot runs on" in r.getMessage()]) == 1
 
 
-def test_a_slow_endpoint_costs_the_schedule_nothing():
+def test_a_slow_endpoint_costs_the_schedule_nothing(often):
     """Snapshots that find the one before still on its way are dropped, and the end is bounded."""
     with serving(delay_s=30) as collector:
         sched = make(f"http://127.0.0.1:{collector.server_port}/x")
         began = time.monotonic()
-        sched.run(duration=2.5)
-        assert time.monotonic() - began < 6.0
-    assert sched.get_node_stats("lidar")["total_ticks"] >= 180
+        sched.run(duration=0.8)
+        assert time.monotonic() - began < 5.0
+    assert sched.get_node_stats("lidar")["total_ticks"] >= 60
     assert 1 <= len(collector.got) <= 2
 
 
-def test_an_endpoint_that_refuses_and_recovers(caplog):
-    """A 503 counts as failure; the endpoint is tried again every second."""
+def test_an_endpoint_that_refuses_and_recovers(often, caplog):
+    """A 503 counts as failure; the endpoint is tried again in the next period."""
     port = free_port()
     sched = make(f"http://127.0.0.1:{port}/x")
 
@@ -238,10 +246,10 @@ def test_an_endpoint_that_refuses_and_recovers(caplog):
         with contextlib.ExitStack() as servers:
             servers.enter_context(serving(port=port, status=503))
             async with sched:
-                await asyncio.sleep(1.2)
+                await asyncio.sleep(0.4)
                 servers.close()
                 healthy = servers.enter_context(serving(port=port))
-                await asyncio.sleep(2.2)
+                await asyncio.sleep(0.8)
                 return list(healthy.got)
 
     assert asyncio.run(main())
