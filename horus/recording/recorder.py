@@ -290,11 +290,12 @@ class Recorder:
             write(item)
             if chunks.full:
                 chunks.flush()
+                self._refresh()
                 self._progress_ns = clock.monotonic_ns()
         if self._jobs:
             self._do_jobs(clock.monotonic_ns())
-        self._refresh()
         chunks.flush_if_due()
+        self._refresh()
         self._progress_ns = clock.monotonic_ns()
 
     def _do_jobs(self, now_ns: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from horus import Node, RecordingReader, Scheduler
 from horus.clock import MonotonicClock, SimClock, Timeline
 from horus.recording import recorder as module
 from horus.recording.encoding import decode
-from horus.recording.mcap_file import Index, packed
+from horus.recording.mcap_file import CHUNK_SIZE, Index, packed
 from horus.recording.reader import RECORD_HEAD, Entry, entries_of, unpack
 from horus.recording.recorder import Recorder
 from horus.recording.scribe import ENVELOPE
@@ -72,17 +73,17 @@ class Disk:
 class Rig:
     """A recorder between a bus and a disk."""
 
-    def __init__(self, timeline: Timeline) -> None:
+    def __init__(self, timeline: Timeline, refresh_size: int | None = None) -> None:
         self.disk = Disk()
         self.recorder = Recorder(timeline, {"name": "rig"}, flush_ns=0)
-        self.recorder.start([self.disk])
+        self.recorder.start([self.disk], refresh_size)
         bus = Bus()
         bus.add_tap(self.recorder.note_message)
-        self._publisher = bus.topic("count").publisher("node")
+        self.publisher = bus.topic("count").publisher("node")
 
     def send(self, count: int) -> None:
         for _ in range(count):
-            self._publisher.send(self._publisher.sent + 1)
+            self.publisher.send(self.publisher.sent + 1)
 
     def stall(self) -> None:
         """Have the writer stand in the middle of writing, with an empty queue behind it."""
@@ -151,6 +152,22 @@ def test_a_disk_that_stands_still_too_long_costs_new_messages_though_there_is_ro
     live.finish()
     assert live.recorder.lost == 3
     assert live.disk.messages() == [1, 5, 6]
+
+
+def test_the_configuration_is_written_again_in_the_middle_of_a_backlog() -> None:
+    """A ring that overwrites what is old always has it, however much is written at once."""
+    refresh_size = 200_000
+    rig = Rig(Timeline(MonotonicClock(), 100), refresh_size)
+    rig.stall()
+    for _ in range(100):
+        rig.publisher.send(os.urandom(30_000))
+    rig.finish()
+    since = 0
+    for chunk in rig.disk.chunks:
+        _, data = unpack(packed(chunk)[RECORD_HEAD.size :])
+        told = any(entry.channel.topic == "horus/scheduler" for entry in entries_of(data))
+        since = 0 if told else since + len(chunk.data)
+        assert since <= refresh_size + 2 * CHUNK_SIZE
 
 
 def test_virtual_time_waits_for_the_disk(simulated: Rig) -> None:
