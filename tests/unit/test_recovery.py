@@ -84,7 +84,7 @@ def test_a_recording_cut_off_anywhere_keeps_every_whole_chunk(recording, sent, t
     some = random.Random(1).sample(range(1, len(data)), OFFSETS)
     some += [end + by for end, _ in chunks for by in (-1, 0, 1)]
     first = min(end for end, _ in chunks)
-    for offset in some:
+    for number, offset in enumerate(some):
         path.write_bytes(data[:offset])
         kept = max((total for end, total in chunks if end <= offset), default=0)
         if offset < first:
@@ -93,9 +93,10 @@ def test_a_recording_cut_off_anywhere_keeps_every_whole_chunk(recording, sent, t
             continue
         salvaged = recover(path)
         assert messages_of(path) == sent[:kept], offset
-        assert count_with_library(path) == salvaged.messages
         assert salvaged.bytes_dropped <= offset
-        assert count_with_library(path, topics=["topic.node0"]) > 0  # by the index
+        if number % 8 == 0:  # the library takes its time
+            assert count_with_library(path) == salvaged.messages
+            assert count_with_library(path, topics=["topic.node0"]) > 0  # by the index
 
 
 def test_recovering_twice_changes_nothing(recording, tmp_path):
