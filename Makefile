@@ -6,7 +6,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 
-.PHONY: demo demo-short test lint types pytest docs bench clean
+.PHONY: demo demo-short test lint types pytest soak docs bench clean
 
 demo: .venv/examples
 	$(BIN)/python examples/warehouse_agv.py
@@ -25,6 +25,10 @@ types: .venv/dev
 
 pytest: .venv/dev
 	$(BIN)/python -m pytest
+
+soak: .venv/dev
+	$(BIN)/python -m pytest -m soak
+	$(BIN)/python -m benchmarks agv --soak 10
 
 docs: .venv/dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

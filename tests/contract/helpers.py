@@ -120,13 +120,15 @@ def running(sched: Scheduler) -> Iterator[threading.Thread]:
         raise errors[0]
 
 
-def run_until(sched: Scheduler, condition: Callable[[], object]) -> None:
+def run_until(
+    sched: Scheduler, condition: Callable[[], object], patience_s: float = PATIENCE_S
+) -> None:
     """Run a scheduler on the calling thread until `condition()` holds, then stop it.
 
     A noisy machine may sleep through any fixed time; what must happen is waited for.
     """
     over, met = threading.Event(), threading.Event()
-    give_up_at = time.monotonic() + PATIENCE_S
+    give_up_at = time.monotonic() + patience_s
 
     def watch() -> None:
         while not over.wait(0.001) and time.monotonic() < give_up_at:

@@ -912,7 +912,8 @@ def test_a_worker_that_floods_its_output_is_bounded(make):
     assert most < 40
 
 
-def test_thousands_of_ticks_with_arrays_leak_nothing(make):
+@pytest.mark.parametrize("ticks", [3_000, pytest.param(10_000, marks=pytest.mark.soak)])
+def test_thousands_of_ticks_with_arrays_leak_nothing(make, ticks):
     """Neither descriptors nor memory, here or there."""
     sched = make(tick_rate=1000)
     image = np.zeros(100_000, np.uint8)
@@ -935,7 +936,7 @@ def test_thousands_of_ticks_with_arrays_leak_nothing(make):
         )
 
     sched.add(Node("sink", hear, rate=100, subs=[Sub("out", capacity=64)]))
-    run_until(sched, lambda: len(uses) >= 3000)
+    run_until(sched, lambda: len(uses) >= ticks, patience_s=60.0)
 
     early, late = uses[100:400], uses[-300:]
     assert max(use[0] for use in late) <= max(use[0] for use in early) + 8
