@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 BENCHMARKS = {
     "micro": "topics, scheduler overhead, event latency, CPU load and import time",
     "agv": "the warehouse AGV: does the motor keep its 1 kHz beside a busy planner?",
-    "recording": "what recording, replay, recovery and telemetry cost, and whether a message is lost",
+    "recording": "recording, replay, recovery and telemetry: what is lost, what it costs",
     "service": "off the interpreter, inside your service: worker processes and embedding",
 }
 """Benchmark name (a module of this package with ``main(argv) -> int``) to its one-line summary."""

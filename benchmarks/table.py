@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from benchmarks.harness import ChildRun, Contender, Measure
 
 
-RUNS_IN_A_WORKLOAD = 4
+RUNS_IN_A_WORKLOAD = 5
 """How often a workload may run for ``--seconds``, before it is given up."""
 QUICK_S = 1.0
 """What stands in for ``--seconds`` with ``--quick`` [s]."""
