@@ -1,4 +1,4 @@
-"""The commands of `python -m horus`: list, describe, recover and compare recordings."""
+"""The commands of `python -m horus`: list, describe, read, recover and compare recordings."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from horus.recording import diff, recovery, sessions
 from horus.recording.scribe import EXACT
 from horus.timing import FOREVER_NS
 from horus.units import NS_PER_S
+
+_LEVELS = {1: "DEBUG", 2: "INFO", 3: "WARNING", 4: "ERROR", 5: "CRITICAL"}
+"""Of foxglove.Log."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -53,6 +56,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     info = command("info", _info, "Say what is in a recording.")
     info.add_argument("recording", type=Path)
+    log = command("log", _log, "Print what was logged and what changed, in the order of time.")
+    log.add_argument("recording", type=Path)
     recover = command("recover", _recover, "Salvage recordings whose process has died.")
     recover.add_argument("recordings", nargs="+", type=Path, metavar="recording")
     comparing = command(
@@ -81,8 +86,8 @@ def _list(options: argparse.Namespace) -> int:
         _print_json(rows)
     else:
         _print_table(
-            ["session", "state", "MB", "file"],
-            ([row["name"], row["state"], f"{row['bytes'] / 1e6:.1f}", row["path"]] for row in rows),
+            ["session", "state", "size", "file"],
+            ([row["name"], row["state"], _size(row["bytes"]), row["path"]] for row in rows),
         )
     return 0
 
@@ -148,6 +153,38 @@ def _info(options: argparse.Namespace) -> int:
     return 0
 
 
+def _log(options: argparse.Namespace) -> int:
+    rows: list[dict[str, Any]] = []
+    with recovery.open_recording(options.recording) as reader:
+        began_ns = reader.about["log_ns"]
+        for entry in reader.entries():
+            topic = entry.channel.topic
+            if topic == "horus/log":
+                said = reader.json_of(entry.data, topic)
+                row = {"kind": _LEVELS.get(said["level"], "LOG"), "text": _with_node(said)}
+            elif topic == "horus/events":
+                change = reader.json_of(entry.data, topic)
+                subject = f"{change['node']}: " if change["node"] else ""
+                row = {"kind": change["kind"], "text": f"{subject}{change['text']}"}
+            else:
+                continue
+            rows.append({"log_ns": entry.log_ns, **row})
+    if options.json:
+        _print_json(rows)
+        return 0
+    for row in rows:
+        print(f"{(row['log_ns'] - began_ns) / NS_PER_S:10.3f} s  {row['kind']:10}  {row['text']}")
+    return 0
+
+
+def _with_node(said: dict[str, Any]) -> str:
+    """Return a log record's text with the node, which it does not name if it is the node's own."""
+    text: str = said["message"]
+    node = said["name"].removeprefix("horus.node.")
+    own = node != said["name"] and not text.startswith(f"{node}: ")
+    return f"{node}: {text}" if own else text
+
+
 def _recover(options: argparse.Namespace) -> int:
     for path in options.recordings:
         recovery_ = recovery.recover(path)
@@ -165,6 +202,10 @@ def _diff(options: argparse.Namespace) -> int:
     else:
         print("no difference" if found is None else found)
     return 0 if found is None else 1
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
 
 
 def _print_json(content: Any) -> None:

@@ -34,7 +34,7 @@ def test_recordings_are_listed(recording, capsys, monkeypatch):
     """With their state; as a table and as JSON; of a directory or of HORUS_HOME."""
     code, out, _ = said(capsys, "recordings", recording.parent)
     assert code == 0
-    assert out.splitlines()[0].split() == ["session", "state", "MB", "file"]
+    assert out.splitlines()[0].split() == ["session", "state", "size", "file"]
     assert recording.stem in out
     assert "finished" in out
     recording.parent.rename(recording.parent.with_name("recordings"))
@@ -56,6 +56,24 @@ def test_info_says_what_is_in_a_recording(recording, capsys):
     content = json.loads(out)
     assert content["scheduler"]["name"] == "rover"
     assert {"topic": "state", "publisher": "plain", "messages": 10} in content["topics"]
+
+
+def test_log_prints_what_was_logged_and_what_changed(tmp_path, capsys):
+    """In the order of time, since the beginning of the recording."""
+    sched = Scheduler(tick_rate=100, deterministic=True, recording=tmp_path)
+    sched.add(Node("arm", lambda node: node.log_warning("low battery"), rate=10))
+    sched.run(duration=0.25)
+    (path,) = sched.stop_recording()
+    code, out, _ = said(capsys, "log", path)
+    assert code == 0
+    lines = [line.split(maxsplit=3) for line in out.splitlines()]
+    warned = [line for line in lines if line[2] == "WARNING" and line[3] == "arm: low battery"]
+    assert [float(line[0]) for line in warned] == [0.0, 0.1, 0.2]
+    assert ["state", "arm: running"] in [line[2:] for line in lines]
+    assert [float(line[0]) for line in lines] == sorted(float(line[0]) for line in lines)
+    _, out, _ = said(capsys, "log", path, "--json")
+    rows = json.loads(out)
+    assert {"log_ns": 100_000_000, "kind": "WARNING", "text": "arm: low battery"} in rows
 
 
 def test_recover_salvages(recording, capsys, tmp_path):
