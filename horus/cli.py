@@ -173,7 +173,8 @@ def _log(options: argparse.Namespace) -> int:
         _print_json(rows)
         return 0
     for row in rows:
-        print(f"{(row['log_ns'] - began_ns) / NS_PER_S:10.3f} s  {row['kind']:10}  {row['text']}")
+        stamp = f"{(row['log_ns'] - began_ns) / NS_PER_S:10.3f} s  {row['kind']:10}  "
+        print(stamp + row["text"].replace("\n", "\n" + " " * len(stamp)))
     return 0
 
 

@@ -101,7 +101,9 @@ class Pose:
     """Where something is and which way it looks; by default where its frame is.
 
     Args:
-        x, y, z: Position [m].
+        x: Position [m].
+        y: Position [m].
+        z: Position [m].
         yaw: Rotation about the z axis [rad].
         orientation: A quaternion in the order x, y, z, w, instead of `yaw`.
     """
@@ -228,7 +230,8 @@ class LaserScan:
     Args:
         frame_id: The frame that the scan is in.
         pose: Where in it the range finder is.
-        start_angle, end_angle: Bearing of the first and of the last beam [rad].
+        start_angle: Bearing of the first beam [rad].
+        end_angle: Bearing of the last beam [rad].
         ranges: Distances, (n_beams,) [m]; one that is not finite becomes 0.
         intensities: Intensities, (n_beams,); none when not given.
     """

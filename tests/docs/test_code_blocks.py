@@ -14,7 +14,7 @@ pytest_plugins = ["pytester"]
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-LANGUAGES = {"python", "text", "console", "toml"}
+LANGUAGES = {"python", "text", "console", "toml", "json"}
 TIMEOUT_S = 30
 
 
@@ -70,7 +70,7 @@ def test_the_tests_on_the_page_about_tests_pass(pytester: pytest.Pytester):
     pytester.makepyfile("\n\n".join(block.code for block in doc_pages.blocks(page)))
     setting = "asyncio_default_fixture_loop_scope=function"
     result = pytester.runpytest_subprocess("-p", "no:cacheprovider", "-o", setting)
-    assert result.parseoutcomes() == {"passed": 8}
+    assert result.parseoutcomes() == {"passed": 9}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
