@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from horus import stats
 from horus.stats import NodeCounters, NodeTiming, TickTimes, TimingReport
 
 durations = st.lists(st.integers(0, 5 * 10**9), min_size=1, max_size=300)
@@ -21,9 +22,24 @@ def test_quantiles_are_close(values: list[int], fraction: float) -> None:
         times.add(value, value)
     true = sorted(values)[math.ceil(fraction * len(values)) - 1]
     found = times.execution_quantile_s(fraction) * 1e9
-    width = 256 if true < 1 << 18 else 1 << 15 if true < 1 << 25 else 1 << 22
-    assert true - 1e-3 <= found <= max(true + width, 0) + 1 or true >= 1 << 32
+    width = max(256, true / 32 if true < 1 << 18 else true / 16)
+    assert true - 1e-3 <= found <= true + width + 1 or true >= 1 << 32
     assert found == pytest.approx(times.latency_quantile_s(fraction) * 1e9)
+
+
+def test_buckets_are_few_and_without_gaps() -> None:
+    """However durations are spread, telemetry has little to read."""
+    units = [*range(1 << 12), *(1 << power for power in range(12, 30)), (1 << 24) - 1]
+    buckets = [stats._bucket(unit) for unit in sorted(units)]
+    assert buckets == sorted(buckets)
+    assert set(range(buckets[1 << 11])) <= set(buckets)
+    assert max(buckets) < 420
+    assert stats._bucket((1 << 24) - 1) == max(buckets) - 1
+    for unit in units:
+        if unit < 1 << 24:
+            assert (
+                unit << 8 < stats._upper_edge_ns(stats._bucket(unit)) <= (unit * 17 // 16 + 1) << 8
+            )
 
 
 @given(durations)
