@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, Protocol, TypeVar
 
 import zstandard
@@ -15,10 +15,12 @@ from horus import clock
 from horus.clock import FOREVER_NS, NEVER, Timeline
 from horus.live import NoteTick
 from horus.recording import mcap_file
+from horus.recording.gaps import LONGEST_NS, SHORTEST_NS, next_gap
 from horus.recording.scribe import Fact, Item, Log, Message, Scribe, Tick
 from horus.snapshot import Frozen
+from horus.timing import Grid
 from horus.topics import Publisher
-from horus.units import NS_PER_S, to_ns
+from horus.units import NS_PER_MS, NS_PER_S, NS_PER_US, to_ns, to_s
 
 _log = logging.getLogger("horus.recording")
 T = TypeVar("T")
@@ -27,7 +29,12 @@ MOST_UNWRITTEN = 65_536
 """Items that may wait to be written."""
 _LONGEST_STALL_NS = 3 * NS_PER_S
 """How long writing may stand still before items are dropped [ns]: large ones fill the memory."""
-_DRAIN_PERIOD_S = 0.025
+_DRAIN_PERIOD_NS = 25 * NS_PER_MS
+_FLUSH_NS = 600 * NS_PER_US
+"""How long it takes to compress and write a chunk, about [ns]."""
+_NAP_NS = 200 * NS_PER_US
+_HURRY = MOST_UNWRITTEN // 16
+"""From so many items in the queue on, the writer gives way to nobody."""
 _SYNC_PERIOD_NS = 1 * NS_PER_S
 """At most so much later it survives a power cut [ns], unless the disk is slow."""
 _FINISH_TIMEOUT_S = 5.0
@@ -93,6 +100,8 @@ class Recorder:
         """
         self.patient: frozenset[str] = frozenset()
         """The nodes that wait rather than lose a message."""
+        self.grids: Callable[[], Collection[Grid]] = tuple
+        """Returns the releases between which to write."""
         self._timeline = timeline
         self._now_ns = timeline.now_ns
         self._queue: deque[Item | _Job] = deque()
@@ -266,7 +275,8 @@ class Recorder:
 
     def _write(self) -> None:
         try:
-            while not self._ending.wait(_DRAIN_PERIOD_S):
+            while not self._ending.is_set():
+                self._give_way(nap_ns=_DRAIN_PERIOD_NS)
                 self._drain()
                 self._tell_losses()
             self._drain()
@@ -281,7 +291,10 @@ class Recorder:
     def _drain(self) -> None:
         """Write what waits now."""
         queue, write, chunks = self._queue, self._scribe.write, self._chunks
+        monotonic_ns, gap_ends_ns = clock.monotonic_ns, self._give_way()
         for _ in range(len(queue)):
+            if monotonic_ns() >= gap_ends_ns:
+                gap_ends_ns = self._give_way(nap_ns=_NAP_NS)
             item = queue.popleft()
             if isinstance(item, _Job):
                 self._jobs.append(item)
@@ -289,6 +302,7 @@ class Recorder:
                 continue
             write(item)
             if chunks.full:
+                gap_ends_ns = self._give_way(_FLUSH_NS)
                 chunks.flush()
                 self._refresh()
                 self._progress_ns = clock.monotonic_ns()
@@ -297,6 +311,23 @@ class Recorder:
         chunks.flush_if_due()
         self._refresh()
         self._progress_ns = clock.monotonic_ns()
+
+    def _give_way(self, least_ns: int = SHORTEST_NS, nap_ns: int = 0) -> int:
+        """Sleep until a gap between releases begins; return when it ends [ns].
+
+        Args:
+            least_ns: How long it has to be [ns].
+            nap_ns: How long to sleep at least [ns].
+        """
+        now_ns = clock.monotonic_ns()
+        if len(self._queue) >= _HURRY:
+            return now_ns + LONGEST_NS
+        begin_ns, end_ns = now_ns + nap_ns, FOREVER_NS
+        if not self._timeline.deterministic:
+            begin_ns, end_ns = next_gap(self.grids(), begin_ns, least_ns)
+        if begin_ns > now_ns:
+            self._ending.wait(to_s(begin_ns - now_ns))
+        return end_ns
 
     def _do_jobs(self, now_ns: int) -> None:
         due = [job for job in self._jobs if job.due_ns <= now_ns]

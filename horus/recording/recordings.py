@@ -21,6 +21,7 @@ from horus.recording.recorder import Recorder
 from horus.recording.scribe import FORMAT
 from horus.recording.session_file import SessionFile
 from horus.spec import ExecutionClass, SchedulerSpec
+from horus.timing import Grid, ReleaseGrid
 from horus.topics import Bus
 from horus.units import NS_PER_MS, NS_PER_US
 
@@ -57,6 +58,7 @@ class Recordings:
         self._file: SessionFile | None = None
         self._blackbox: Blackbox | None = None
         self._files: list[Path] = []
+        self._timed: list[LiveNode] = []
 
     @property
     def active(self) -> bool:
@@ -81,7 +83,8 @@ class Recordings:
         if not sinks:
             return
         recorder.start(sinks, self._blackbox.refresh_size if self._blackbox else None)
-        self._recorder = recorder
+        self._recorder, self._timed = recorder, []
+        recorder.grids = self._grids
         # A program that ends without ending its session should not leave half a file.
         atexit.register(recorder.finish)
         for live in lives:
@@ -95,6 +98,8 @@ class Recordings:
             return
         live.note_tick = recorder.tick_noter(live.name)
         live.note_change = functools.partial(self._note_change, recorder, live.name)
+        if live.spec.execution_class is ExecutionClass.RT:
+            self._timed.append(live)
         loop_only = live.spec.execution_class is ExecutionClass.BEST_EFFORT
         if self._spec.recording_blocks and loop_only:
             recorder.patient |= {live.name}
@@ -174,6 +179,11 @@ class Recordings:
             # Once supervision has logged what it has found, and where.
             self.dump_soon(reason, delay_s=_AFTERMATH_S)
 
+    def _grids(self) -> set[Grid]:
+        """Return when Rt nodes are released, each rate once."""
+        rates_hz = {live.spec.rate_hz for live in tuple(self._timed) if not live.retired}
+        return {_grid(self._timeline.epoch_ns, rate_hz) for rate_hz in rates_hz}
+
     def _end(self, recorder: Recorder) -> None:
         self._bus.remove_tap(recorder.note_message)
         atexit.unregister(recorder.finish)
@@ -200,6 +210,10 @@ class Recordings:
             "python": platform.python_version(),
             "machine": platform.node(),
         }
+
+
+_grid = functools.lru_cache(256)(ReleaseGrid)
+"""Asked for before each slice of what is written, and made of fractions, which takes long."""
 
 
 def _configuration(live: LiveNode) -> dict[str, Any]:
