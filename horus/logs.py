@@ -9,7 +9,9 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+
+from horus.errors import describe
 
 _root = logging.getLogger("horus")
 _MOST_UNWRITTEN = 10_000
@@ -53,6 +55,15 @@ def _stderr_handler() -> Iterator[None]:
         writer.finish()
 
 
+def readable(record: logging.LogRecord, format_record: Callable[[logging.LogRecord], str]) -> str:
+    """Return a record in words, whatever is wrong with it."""
+    try:
+        return format_record(record)
+    except Exception as exc:  # a message and its arguments that do not go together
+        what, why = describe(record.msg), describe(exc)
+        return f"{record.levelname} {record.name}: {what} cannot be formatted: {why}"
+
+
 class _BoundedHandler(logging.handlers.QueueHandler):
     """Hands records to the writer; when that cannot keep up, they are dropped."""
 
@@ -83,13 +94,7 @@ class _Writer(threading.Thread):
         while (record := self.records.get()) is not None:
             # Gone, closed, or a full disk: there is nobody left to tell.
             with contextlib.suppress(OSError, ValueError):
-                self._write(self._readable(record) + "\n")
-
-    def _readable(self, record: logging.LogRecord) -> str:
-        try:
-            return self._format(record)
-        except Exception as exc:  # a message and its arguments that do not go together
-            return f"{record.levelname} {record.name}: {record.msg!r} cannot be formatted: {exc!r}"
+                self._write(readable(record, self._format) + "\n")
 
     @staticmethod
     def _write(text: str) -> None:

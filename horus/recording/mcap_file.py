@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import os
 import struct
+import tempfile
 import zlib
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol
@@ -49,68 +51,116 @@ MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 _RECORD_HEAD_SIZE = 9
 _MESSAGE_FIELDS_SIZE = MESSAGE_HEAD.size - _RECORD_HEAD_SIZE
 _LAST_SEQUENCE = 2**32 - 1
+_MOST_IN_MEMORY = 1 << 20
+"""How much is kept in memory of what is told of the chunks [bytes]."""
 
 Index = dict[int, list[int]]
 """By channel, log time [ns] and place in the chunk of each message, one after the other."""
 
 
-class Summary:
-    """What the end of a file tells about the rest of it."""
+class Definitions:
+    """The schemas and channels of a file, by number."""
 
     def __init__(self) -> None:
-        """Begin with an empty file."""
+        """Begin with none."""
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self.chunks: list[ChunkIndex] = []
-        self.counts: Counter[int] = Counter()
-        """Messages by channel."""
 
     def define(self, record: Schema | Channel) -> None:
         """Take note of a schema or a channel."""
         kept: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
         kept[record.id] = record
 
+
+class Summary:
+    """What the end of a file tells about the rest of it.
+
+    There are ten chunks or more in a second, and a robot may record for weeks: what is told of
+    each is kept on the disk, once it is more than a little.
+
+    Thread: one at a time.
+    """
+
+    def __init__(self, definitions: Definitions, directory: Path) -> None:
+        """Begin with an empty file.
+
+        Args:
+            definitions: The schemas and channels that its chunks refer to.
+            directory: Where a file without a name may be kept.
+        """
+        self._definitions = definitions
+        self._counts: Counter[int] = Counter()
+        self._first_ns, self._last_ns, self._chunks = FOREVER_NS, 0, 0
+        self._entries = tempfile.SpooledTemporaryFile(  # noqa: SIM115 - until close
+            _MOST_IN_MEMORY, dir=str(directory)
+        )
+        self._error: OSError | None = None
+
+    @property
+    def message_count(self) -> int:
+        """How many messages of all channels there are."""
+        return self._counts.total()
+
     def add_chunk(self, entry: ChunkIndex, index: Index) -> None:
         """Take note of a chunk that was written."""
-        self.chunks.append(entry)
         for channel, entries in index.items():
-            self.counts[channel] += len(entries) // 2
+            self._counts[channel] += len(entries) // 2
+        self._chunks += 1
+        self._first_ns = min(self._first_ns, entry.message_start_time)
+        self._last_ns = max(self._last_ns, entry.message_end_time)
+        try:
+            self._entries.write(packed(entry))
+        except OSError as exc:  # the chunk is there all the same
+            self._error = exc
 
-    def end(self, start: int) -> bytes:
-        """Return the end of a file whose data ends at `start`, which this end begins at."""
+    def end(self, start: int) -> Iterator[bytes]:
+        """Yield the end of a file whose data ends at `start`, which this end begins at.
+
+        Raises:
+            OSError: What there is to tell could not be kept.
+        """
+        if self._error is not None:
+            raise self._error
         head = packed(DataEnd(0))
-        start += len(head)
-        body = bytearray()
+        yield head
+        begin = start = start + len(head)
+        crc = 0
         offsets: list[SummaryOffset] = []
-        groups: list[tuple[Opcode, list[McapRecord]]] = [
-            (Opcode.SCHEMA, [*self.schemas.values()]),
-            (Opcode.CHANNEL, [*self.channels.values()]),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, [*self.chunks]),
-        ]
-        for opcode, records in groups:
-            if records:
-                group = packed(*records)
-                offsets.append(SummaryOffset(opcode, start + len(body), len(group)))
-                body += group
-        offsets_start = start + len(body)
-        body += packed(*offsets)
+        for opcode, group in self._groups():
+            size = 0
+            for part in group:
+                crc = zlib.crc32(part, crc)
+                size += len(part)
+                yield part
+            if size:
+                offsets.append(SummaryOffset(opcode, start, size))
+            start += size
         # The checksum covers the footer, too, up to itself.
-        footer = packed(Footer(start, offsets_start, 0))[:-4]
-        crc = zlib.crc32(footer, zlib.crc32(body))
-        return b"".join((head, body, footer, struct.pack("<I", crc), MCAP0_MAGIC))
+        last = packed(*offsets, Footer(begin, start, 0))[:-4]
+        yield b"".join((last, struct.pack("<I", zlib.crc32(last, crc)), MCAP0_MAGIC))
+
+    def close(self) -> None:
+        """Give back what it holds."""
+        self._entries.close()
+
+    def _groups(self) -> Iterator[tuple[Opcode, Iterable[bytes]]]:
+        yield Opcode.SCHEMA, map(packed, self._definitions.schemas.values())
+        yield Opcode.CHANNEL, map(packed, self._definitions.channels.values())
+        yield Opcode.STATISTICS, [packed(self._statistics())]
+        self._entries.seek(0)
+        yield Opcode.CHUNK_INDEX, iter(lambda: self._entries.read(_MOST_IN_MEMORY), b"")
 
     def _statistics(self) -> Statistics:
         return Statistics(
             attachment_count=0,
-            channel_count=len(self.channels),
-            channel_message_counts=dict(self.counts),
-            chunk_count=len(self.chunks),
-            message_count=self.counts.total(),
+            channel_count=len(self._definitions.channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=self._chunks,
+            message_count=self.message_count,
             metadata_count=0,
-            message_start_time=min((c.message_start_time for c in self.chunks), default=0),
-            message_end_time=max((c.message_end_time for c in self.chunks), default=0),
-            schema_count=len(self.schemas),
+            message_start_time=self._first_ns if self._chunks else 0,
+            message_end_time=self._last_ns,
+            schema_count=len(self._definitions.schemas),
         )
 
 
@@ -120,9 +170,9 @@ class ChunkBuilder:
     Thread: one at a time.
     """
 
-    def __init__(self, summary: Summary) -> None:
-        """Begin empty; `summary` defines the channels."""
-        self._summary = summary
+    def __init__(self, definitions: Definitions) -> None:
+        """Begin empty; `definitions` has the channels."""
+        self._definitions = definitions
         self._records = bytearray()
         self._index: Index = {}
         self._schemas: set[int] = set()
@@ -157,11 +207,11 @@ class ChunkBuilder:
         self._records += data
 
     def _define(self, channel: int) -> None:
-        definition = self._summary.channels[channel]
+        definition = self._definitions.channels[channel]
         schema = definition.schema_id
         if schema and schema not in self._schemas:
             self._schemas.add(schema)
-            self._records += packed(self._summary.schemas[schema])
+            self._records += packed(self._definitions.schemas[schema])
         self._records += packed(definition)
 
     def take(self, compressor: zstandard.ZstdCompressor) -> tuple[Chunk, Index]:
@@ -208,17 +258,28 @@ class AppendedFile:
         Raises:
             OSError: It could not be written: the disk is full, or the file was deleted.
         """
+        return self.append_all([data])
+
+    def append_all(self, parts: Iterable[bytes]) -> int:
+        """Write all parts, or nothing; return where they begin [bytes].
+
+        Raises:
+            OSError: They could not be written: the disk is full, or the file was deleted.
+        """
         if not os.fstat(self._descriptor).st_nlink:
             raise FileNotFoundError("it was deleted")
-        start, rest = self.size, memoryview(data)
+        start = end = self.size
         try:
-            while rest:
-                rest = rest[os.pwrite(self._descriptor, rest, start + len(data) - len(rest)) :]
+            for part in parts:
+                rest = memoryview(part)
+                while rest:
+                    written = os.pwrite(self._descriptor, rest, end)
+                    rest, end = rest[written:], end + written
         except OSError:
             # Half a chunk is of no use, and in the way of the next.
             os.ftruncate(self._descriptor, start)
             raise
-        self.size = start + len(data)
+        self.size = end
         return start
 
     def sync(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -14,6 +15,7 @@ from mcap.records import Chunk
 from horus import clock
 from horus.clock import FOREVER_NS, NEVER, Timeline
 from horus.live import NoteTick
+from horus.logs import readable
 from horus.recording import mcap_file
 from horus.recording.gaps import LONGEST_NS, SHORTEST_NS, next_gap
 from horus.recording.scribe import Fact, Item, Log, Message, Scribe, Tick
@@ -27,8 +29,12 @@ T = TypeVar("T")
 
 MOST_UNWRITTEN = 65_536
 """Items that may wait to be written."""
+MOST_UNWRITTEN_BYTES = 256_000_000
+"""How much large messages that wait to be written may come to [bytes]."""
+_LARGE = 1024
+"""From this size on a message is large [bytes]: `MOST_UNWRITTEN` bounds the others well enough."""
 _LONGEST_STALL_NS = 3 * NS_PER_S
-"""How long writing may stand still before items are dropped [ns]: large ones fill the memory."""
+"""How long writing may stand still before items are dropped [ns]: it may be so for good."""
 _DRAIN_PERIOD_NS = 25 * NS_PER_MS
 _FLUSH_NS = 600 * NS_PER_US
 """How long it takes to compress and write a chunk, about [ns]."""
@@ -107,11 +113,13 @@ class Recorder:
         self._queue: deque[Item | _Job] = deque()
         self._jobs: list[_Job] = []
         self._lock = threading.Lock()
-        self._lost = 0
+        self._lost = self._unwritable = self._large_bytes = 0
+        self._sizes: dict[Publisher, int] = {}
         self._recording = True
         self._ending = threading.Event()
         self._progress_ns = self._told_ns = clock.monotonic_ns()
         self._told_lost = 0
+        self._told_unwritable = False
         self._told_of: set[str] = set()
         self._chunks = _Chunks(flush_ns)
         self._scribe = Scribe(self._chunks, timeline.wall_offset_ns)
@@ -123,14 +131,14 @@ class Recorder:
         self.note_fact("horus/scheduler", about)
 
     @property
-    def definitions(self) -> mcap_file.Summary:
+    def definitions(self) -> mcap_file.Definitions:
         """The schemas and channels that the chunks refer to."""
         return self._chunks.definitions
 
     @property
     def lost(self) -> int:
         """How many items were dropped, because writing them did not keep up or failed."""
-        return self._lost + sum(sink.lost for sink in self._chunks.sinks)
+        return self._lost + self._unwritable + sum(sink.lost for sink in self._chunks.sinks)
 
     def start(self, sinks: Iterable[Sink], refresh_size: int | None = None) -> None:
         """Write to sinks, which it owns from now on.
@@ -154,8 +162,16 @@ class Recorder:
         else:
             release_ns = context.release_ns if context.ticking else NEVER
             cycle, node = context.cycle(), context.node
-        now_ns = self._now_ns()
-        self._put(Message(now_ns, release_ns, cycle, publisher, publisher.sent, frozen), node)
+        # As large as those before it: to look into each would take too long.
+        size = self._sizes.get(publisher)
+        if size is None:
+            size = sys.getsizeof(frozen[0])
+        if size < _LARGE:
+            size = 0
+        message = Message(
+            self._now_ns(), release_ns, cycle, publisher, publisher.sent, frozen, size
+        )
+        self._put(message, node, size)
 
     def tick_noter(self, node: str) -> NoteTick:
         """Return what takes note of the ticks of a node."""
@@ -200,25 +216,33 @@ class Recorder:
         """Take note of a log record, and how it reads."""
         self._put(Log(self._now_ns(), record, text), "")
 
-    def _put(self, item: Item, node: str) -> None:
+    def _put(self, item: Item, node: str, size: int = 0) -> None:
         if not self._recording:
             return
-        queue = self._queue
-        if len(queue) >= MOST_UNWRITTEN or self._is_stuck():
-            if self._timeline.deterministic or node in self.patient:
+        if self._has_no_room():
+            if threading.current_thread() is self._thread:
+                pass  # It has something to tell, or runs the application's code: who else writes?
+            elif self._timeline.deterministic or node in self.patient:
                 self._wait_for_room()
             else:
                 with self._lock:
                     self._lost += 1
                 return
-        queue.append(item)
+        if size:
+            with self._lock:
+                self._large_bytes += size
+        self._queue.append(item)
 
-    def _is_stuck(self) -> bool:
+    def _has_no_room(self) -> bool:
         # Of the OS clock, not the timeline's: simulated time runs as fast as it likes.
-        return clock.monotonic_ns() - self._progress_ns > _LONGEST_STALL_NS
+        return (
+            len(self._queue) >= MOST_UNWRITTEN
+            or self._large_bytes >= MOST_UNWRITTEN_BYTES
+            or clock.monotonic_ns() - self._progress_ns > _LONGEST_STALL_NS
+        )
 
     def _wait_for_room(self) -> None:
-        while self._recording and (len(self._queue) >= MOST_UNWRITTEN or self._is_stuck()):
+        while self._recording and self._has_no_room():
             if not self._thread.is_alive():
                 return
             self._ending.wait(0.001)
@@ -290,7 +314,7 @@ class Recorder:
 
     def _drain(self) -> None:
         """Write what waits now."""
-        queue, write, chunks = self._queue, self._scribe.write, self._chunks
+        queue, chunks = self._queue, self._chunks
         monotonic_ns, gap_ends_ns = clock.monotonic_ns, self._give_way()
         for _ in range(len(queue)):
             if monotonic_ns() >= gap_ends_ns:
@@ -300,7 +324,7 @@ class Recorder:
                 self._jobs.append(item)
                 self._do_jobs(clock.monotonic_ns())
                 continue
-            write(item)
+            self._write_item(item)
             if chunks.full:
                 gap_ends_ns = self._give_way(_FLUSH_NS)
                 chunks.flush()
@@ -311,6 +335,23 @@ class Recorder:
         chunks.flush_if_due()
         self._refresh()
         self._progress_ns = clock.monotonic_ns()
+
+    def _write_item(self, item: Item) -> None:
+        try:
+            size = self._scribe.write(item)
+        except Exception:  # whatever it is, the others are written
+            self._unwritable += 1
+            if not self._told_unwritable:
+                self._told_unwritable = True
+                _log.exception("%s cannot be recorded, nor can others perhaps", type(item).__name__)
+            size = 0
+        if type(item) is Message:
+            # The largest of late: a publisher's messages need not be of one size.
+            known = self._sizes.get(item.publisher, 0)
+            self._sizes[item.publisher] = max(size, known - known // 8)
+            if item.size:
+                with self._lock:
+                    self._large_bytes -= item.size
 
     def _give_way(self, least_ns: int = SHORTEST_NS, nap_ns: int = 0) -> int:
         """Sleep until a gap between releases begins; return when it ends [ns].
@@ -342,7 +383,7 @@ class Recorder:
         if size is not None and written - self._refreshed_at >= size:
             self._refreshed_at = written
             for fact in list(self._configuration.values()):
-                self._scribe.write(fact._replace(at_ns=self._now_ns()))
+                self._write_item(fact._replace(at_ns=self._now_ns()))
 
     def _tell_losses(self, *, finally_: bool = False) -> None:
         """Say what was lost since this was said before, once a second."""
@@ -358,7 +399,7 @@ class Recorder:
         if lost:
             text = f"{lost} items were lost, because writing does not keep up"
             content = {"kind": "lost", "node": "", "text": text}
-            self._scribe.write(Fact("horus/events", self._now_ns(), content))
+            self._write_item(Fact("horus/events", self._now_ns(), content))
             _log.error("%s", text)
 
 
@@ -369,7 +410,7 @@ class _Chunks:
     """
 
     def __init__(self, flush_ns: int) -> None:
-        self.definitions = mcap_file.Summary()
+        self.definitions = mcap_file.Definitions()
         self.sinks: list[Sink] = []
         self._chunk = mcap_file.ChunkBuilder(self.definitions)
         self.define = self.definitions.define
@@ -411,10 +452,11 @@ class _LogHandler(logging.Handler):
         self._note = note
         self._format = logging.Formatter().format
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """Put it in words now: its arguments may change."""
-        try:
-            text = self._format(record)
-        except Exception as exc:  # a message and its arguments that do not go together
-            text = f"{record.msg!r} cannot be formatted: {exc!r}"
-        self._note(record, text)
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Take note of a record, without a lock: in virtual time this waits for the writer.
+
+        And the writer logs, too.
+        """
+        # In words now: its arguments may change.
+        self._note(record, readable(record, self._format))
+        return True

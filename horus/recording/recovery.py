@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import struct
@@ -78,31 +79,37 @@ def open_recording(path: str | os.PathLike[str]) -> RecordingReader:
 
 
 def _recover(path: Path, descriptor: int) -> Recovery:
-    with reader.open_file(path) as file:
-        size = os.fstat(descriptor).st_size
-        found = _survey(file)
-    finished = sessions.state_of(path) == "finished"
-    if finished and not found.damaged:
-        return Recovery(path, found.summary.counts.total(), 0)
+    definitions = mcap_file.Definitions()
+    with contextlib.closing(mcap_file.Summary(definitions, path.parent)) as summary:
+        with reader.open_file(path) as file:
+            size = os.fstat(descriptor).st_size
+            found = _survey(file, definitions, summary)
+        finished = sessions.state_of(path) == "finished"
+        dropped = 0
+        if found.damaged or not finished:
+            dropped = _end(descriptor, found, summary)
+            if not finished:
+                dropped += size - found.end
+        return Recovery(path, summary.message_count, dropped)
+
+
+def _end(descriptor: int, found: _Survey, summary: mcap_file.Summary) -> int:
+    """Give a file the end that it lacks; return how many bytes of it are damaged."""
     for record in found.damaged:
         os.pwrite(descriptor, bytes([_IGNORED_OPCODE]), record.offset)
     os.ftruncate(descriptor, found.end)
     output = mcap_file.AppendedFile(descriptor)
     if found.unindexed is not None:
-        mcap_file.append_index(output, found.summary, *found.unindexed)
-    output.append(found.summary.end(output.size))
+        mcap_file.append_index(output, summary, *found.unindexed)
+    output.append_all(summary.end(output.size))
     output.sync()
-    dropped = sum(record.end - record.offset for record in found.damaged)
-    if not finished:
-        dropped += size - found.end
-    return Recovery(path, found.summary.counts.total(), dropped)
+    return sum(record.end - record.offset for record in found.damaged)
 
 
 @dataclass(slots=True)
 class _Survey:
-    """What is in a file, whether it has an end or not."""
+    """How far a file is good, whether it has an end or not."""
 
-    summary: mcap_file.Summary
     end: int = 0
     """Where what can be used ends."""
     damaged: list[Record] = field(default_factory=list)
@@ -111,21 +118,23 @@ class _Survey:
     """The last chunk, if its index is cut short."""
 
 
-def _survey(file: BinaryIO) -> _Survey:
-    found = _Survey(mcap_file.Summary())
+def _survey(
+    file: BinaryIO, definitions: mcap_file.Definitions, summary: mcap_file.Summary
+) -> _Survey:
+    found = _Survey()
     chunk: tuple[ChunkIndex, mcap_file.Index] | None = None
     for record in reader.records(file):
         if record.opcode == Opcode.CHUNK:
             if chunk is not None:
-                found.summary.add_chunk(*chunk)
+                summary.add_chunk(*chunk)
             try:
-                head, definitions, index = survey_chunk(record.content)
+                head, defined, index = survey_chunk(record.content)
             except ValueError:
                 found.damaged.append(record)
                 chunk = None
             else:
-                for definition in definitions:
-                    found.summary.define(definition)
+                for definition in defined:
+                    definitions.define(definition)
                 length = record.end - record.offset
                 chunk = mcap_file.chunk_index(head, record.offset, length), index
         elif record.opcode == Opcode.MESSAGE_INDEX and chunk is not None:
@@ -139,7 +148,7 @@ def _survey(file: BinaryIO) -> _Survey:
     if chunk is not None:
         entry, index = chunk
         if entry.message_index_offsets.keys() == index.keys():
-            found.summary.add_chunk(entry, index)
+            summary.add_chunk(entry, index)
         else:
             found.unindexed = chunk
             found.end = entry.chunk_start_offset + entry.chunk_length

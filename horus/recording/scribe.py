@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import struct
 from collections.abc import Mapping
@@ -24,6 +25,7 @@ import msgspec
 from mcap.records import Channel, Schema
 
 from horus.clock import NEVER
+from horus.errors import describe
 from horus.foxglove import DECLARATIONS, LOG_SCHEMA, Declaration, object_schema, timestamp
 from horus.recording.encoding import UnrecordableError, encode, name_of
 from horus.snapshot import Frozen
@@ -40,7 +42,17 @@ _ARRAY_OF_3, _INT64 = 0x93, 0xD3
 OUTSIDE = -1
 """The release of a message that no tick has sent."""
 
+_MOST_CHANNELS = 2**16 - 1
+
 _json = msgspec.json.Encoder().encode
+
+
+def _text(content: Mapping[str, Any]) -> bytes:
+    """Return JSON; characters that Unicode has no place for become question marks."""
+    try:
+        return _json(content)
+    except UnicodeEncodeError:  # from a file name that is no UTF-8, say
+        return json.dumps(content, ensure_ascii=False).encode("utf-8", "replace")
 
 
 class Message(NamedTuple):
@@ -52,6 +64,8 @@ class Message(NamedTuple):
     publisher: Publisher
     sequence: int
     frozen: Frozen
+    size: int
+    """How large it was thought to be when it was sent [bytes]; 0 if not worth mentioning."""
 
 
 class Tick(NamedTuple):
@@ -139,18 +153,23 @@ class Scribe:
         self.refused: dict[str, str] = {}
         """What is not written as it should be, and why, by topic."""
 
-    def write(self, item: Item) -> None:
-        """Write one item."""
+    def write(self, item: Item) -> int:
+        """Write one item; return the size of a message [bytes].
+
+        Raises:
+            UnrecordableError: There are more channels than a file can have.
+        """
         # By type, the most frequent first: there are thousands in a second.
         kind = type(item)
         if kind is Message:
-            self._write_message(*item)
+            return self._write_message(*item)
         elif kind is Tick:
             self._write_tick(*item)
         elif kind is Log:
             self._write_log(*item)
         else:
             self._write_fact(*item)
+        return 0
 
     def _write_message(
         self,
@@ -160,18 +179,19 @@ class Scribe:
         publisher: Publisher,
         sequence: int,
         frozen: Frozen,
-    ) -> None:
-        channel = self._of_publisher.get(publisher)
-        if channel is None:
-            channel = self._of_publisher[publisher] = self._open_topic(publisher)
+        size: int,
+    ) -> int:
         payload, thaw = frozen
         try:
+            channel = self._of_publisher.get(publisher)
+            if channel is None:
+                channel = self._of_publisher[publisher] = self._open_topic(publisher)
             message = payload if thaw is None else thaw(payload)
             data = encode(message)
         except Exception as exc:  # also of the code of a message's own class
             reason = str(exc) if isinstance(exc, UnrecordableError) else f"{exc!r}"
             self.refused.setdefault(publisher.topic.name, f"are not recorded: {reason}")
-            return
+            return 0
         offset_ns = self._offset_ns
         release_ns = OUTSIDE if release_ns == NEVER else release_ns + offset_ns
         envelope = ENVELOPE.pack(_ARRAY_OF_3, _INT64, cycle, _INT64, release_ns)
@@ -179,6 +199,7 @@ class Scribe:
         self._writer.add_message(channel, sequence, sent_ns, sent_ns, envelope + data)
         if publisher.foxglove is not None:
             self._write_for_viewers(publisher, publisher.foxglove, sequence, sent_ns, message)
+        return len(data)
 
     def _write_for_viewers(
         self,
@@ -191,10 +212,10 @@ class Scribe:
         topic, schema = publisher.topic.name, declaration.schema_name
         try:
             data = _json(declaration.converted(message, wall_ns))
+            channel = self._open(f"foxglove/{topic}", schema, publisher.owner)
         except Exception as exc:  # also of the application's own callables
-            self.refused.setdefault(topic, f"are not shown as {schema}: {exc}")
+            self.refused.setdefault(topic, f"are not shown as {schema}: {describe(exc, 500)}")
             return
-        channel = self._open(f"foxglove/{topic}", schema, publisher.owner)
         self._writer.add_message(channel, sequence, wall_ns, wall_ns, data)
 
     def _write_tick(
@@ -227,7 +248,7 @@ class Scribe:
 
     def _write_log(self, at_ns: int, record: logging.LogRecord, text: str) -> None:
         at_ns += self._offset_ns
-        data = _json(
+        data = _text(
             {
                 "timestamp": timestamp(at_ns),
                 "level": next((to for least, to in _FOXGLOVE_LEVELS if record.levelno >= least), 0),
@@ -242,7 +263,7 @@ class Scribe:
     def _write_fact(self, channel: str, at_ns: int, content: Mapping[str, Any]) -> None:
         at_ns += self._offset_ns
         number = self._open(channel, _SCHEMA_OF_CHANNEL[channel])
-        self._writer.add_message(number, 0, at_ns, at_ns, _json(content))
+        self._writer.add_message(number, 0, at_ns, at_ns, _text(content))
 
     def _open_topic(self, publisher: Publisher) -> int:
         topic = publisher.topic
@@ -267,6 +288,11 @@ class Scribe:
     ) -> int:
         key = (name, publisher)
         if key not in self._channels:
+            if len(self._channels) == _MOST_CHANNELS:
+                raise UnrecordableError(
+                    f"an MCAP file has at most {_MOST_CHANNELS} channels, "
+                    "and there is one for each topic and publisher"
+                )
             self._channels[key] = len(self._channels) + 1
             self._writer.define(Channel(self._channels[key], name, encoding, metadata, schema))
         return self._channels[key]

@@ -10,7 +10,7 @@ from pathlib import Path
 from mcap.records import Chunk
 
 from horus.recording import mcap_file, sessions
-from horus.recording.mcap_file import Index, Summary
+from horus.recording.mcap_file import Definitions, Index, Summary
 
 _log = logging.getLogger("horus.recording")
 
@@ -21,12 +21,12 @@ class SessionFile:
     Thread: one at a time.
     """
 
-    def __init__(self, directory: Path, definitions: Summary) -> None:
+    def __init__(self, directory: Path, definitions: Definitions) -> None:
         """Begin a session.
 
         Args:
             directory: Where its file goes.
-            definitions: Knows the schemas and channels that the chunks refer to.
+            definitions: The schemas and channels that the chunks refer to.
 
         Raises:
             OSError: The file cannot be made or written.
@@ -34,8 +34,7 @@ class SessionFile:
         self.lost = 0
         """How many items were in chunks that could not be written."""
         self.path, self._descriptor = sessions.create(directory)
-        self._definitions = definitions
-        self._summary = Summary()
+        self._summary = Summary(definitions, directory)
         self._failing = False
         self._file = mcap_file.AppendedFile(self._descriptor)
         try:
@@ -66,10 +65,8 @@ class SessionFile:
 
     def finish(self) -> None:
         """Write the end."""
-        self._summary.schemas = self._definitions.schemas
-        self._summary.channels = self._definitions.channels
         try:
-            self._file.append(self._summary.end(self._file.size))
+            self._file.append_all(self._summary.end(self._file.size))
             self._file.sync()
         except OSError as exc:
             if not self._failing:
@@ -77,4 +74,5 @@ class SessionFile:
 
     def close(self) -> None:
         """Close it, which gives its lock back."""
+        self._summary.close()
         os.close(self._descriptor)

@@ -70,16 +70,22 @@ def create(directory: Path, kind: str = "session", suffix: str = SUFFIX) -> tupl
         path = directory / f"{name}{suffix}"
         with contextlib.suppress(FileExistsError):
             descriptor = mcap_file.create(path)
-            lock(descriptor)
+            lock(descriptor, wait=True)
             return path, descriptor
     raise FileExistsError(f"there are 1000 sessions called {stem} in {directory}")
 
 
-def lock(descriptor: int) -> bool:
-    """Lock an open file for as long as it is open; return whether nobody else has."""
+def lock(descriptor: int, *, wait: bool = False) -> bool:
+    """Lock an open file for as long as it is open; return whether nobody else has.
+
+    Args:
+        descriptor: The file.
+        wait: Whether to wait for others to be done with it. With a new file that is for those
+            who look at how it stands, and takes no time.
+    """
     if fcntl is not None:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except OSError:
             return False
     return True

@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import threading
 import time
+import tracemalloc
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
-from mcap.records import Chunk
+from mcap.records import Channel, Chunk
 
 from horus import Node, RecordingReader, Scheduler
 from horus.clock import MonotonicClock, SimClock, Timeline
 from horus.recording import recorder as module
 from horus.recording.encoding import decode
-from horus.recording.mcap_file import CHUNK_SIZE, Index, packed
+from horus.recording.mcap_file import (
+    CHUNK_SIZE,
+    Definitions,
+    Index,
+    Summary,
+    chunk_index,
+    packed,
+)
 from horus.recording.reader import RECORD_HEAD, Entry, entries_of, unpack
 from horus.recording.recorder import Recorder
 from horus.recording.scribe import ENVELOPE
 from horus.recording.session_file import SessionFile
 from horus.topics import Bus
 
+LOG = "horus/log"
 ROOM = 100
 """Items that may wait in these tests."""
 PATIENCE_S = 10.0
@@ -268,3 +279,136 @@ def test_backpressure_is_for_best_effort_nodes_only(rate, waits, tmp_path, monke
         assert len(counts) < 3 * ROOM
         assert took_s[0] < stalled_s / 2
         assert losses
+
+
+def test_large_messages_are_bounded_by_their_size(
+    live: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that moves, too slowly for a camera, does not cost the memory."""
+    monkeypatch.setattr(module, "MOST_UNWRITTEN_BYTES", 1_000_000)
+    image = bytes(100_000)
+    live.publisher.send({"pixels": image})  # its size is known once it was written
+    live.recorder.do(lambda: None)
+    live.stall()
+    live.publisher.send({"pixels": image})
+    before = live.recorder.lost
+    for _ in range(50):
+        live.publisher.send({"pixels": image})
+    assert 38 <= live.recorder.lost - before < 50
+    live.disk.flows.set()
+    for _ in range(2):
+        live.recorder.do(lambda: None)
+    lost = live.recorder.lost
+    live.publisher.send({"pixels": image})
+    assert live.recorder.lost == lost
+
+
+@pytest.mark.parametrize("text", ["no \udc80 name", "100 % of {}"])
+def test_a_log_record_of_any_text_is_recorded(live: Rig, text: str) -> None:
+    """What is no Unicode reads as question marks, and the writer goes on."""
+    logging.getLogger("horus.node.it").warning(text)
+    live.send(3)
+    live.finish()
+    assert live.disk.messages() == [1, 2, 3]
+    logs = [json.loads(bytes(e.data)) for e in live.disk.entries() if e.channel.topic == LOG]
+    assert [log["message"] for log in logs] == [text.replace("\udc80", "?")]
+
+
+def test_a_record_that_cannot_be_put_in_words_does_not_harm_who_logs(
+    live: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The object's own error stays out of the tick, and stands in the log."""
+    monkeypatch.setattr(logging.getLogger("horus"), "propagate", False)  # pytest lets it through
+
+    class Odd:
+        def __repr__(self) -> str:
+            raise ZeroDivisionError
+
+    logger = logging.getLogger("horus.node.it")
+    logger.handle(logger.makeRecord(logger.name, logging.ERROR, "f", 1, Odd(), (), None))
+    live.finish()
+    (log,) = [json.loads(bytes(e.data)) for e in live.disk.entries() if e.channel.topic == LOG]
+    assert "Odd whose repr raised ZeroDivisionError" in log["message"]
+
+
+def test_an_item_that_cannot_be_written_costs_itself_only(
+    live: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is counted and told of once."""
+    for _ in range(2):
+        live.recorder.note_fact("horus/nodes", {"name": object()})
+    live.send(2)
+    live.finish()
+    assert live.disk.messages() == [1, 2]
+    assert live.recorder.lost == 2
+    assert caplog.text.count("cannot be recorded") == 1
+
+
+def test_more_channels_than_a_file_can_have(
+    live: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Those that were there are recorded, the others are refused with the reason."""
+    monkeypatch.setattr("horus.recording.scribe._MOST_CHANNELS", 2)  # one is the scheduler's
+    live.send(1)
+    other = Bus()
+    other.add_tap(live.recorder.note_message)
+    other.topic("another").publisher("node").send(1)
+    live.send(1)
+    live.finish()
+    assert live.disk.messages() == [1, 2]
+    assert "'another' are not recorded: an MCAP file has at most 2 channels" in caplog.text
+
+
+def test_the_writer_does_not_wait_for_itself(simulated: Rig) -> None:
+    """In virtual time whoever sends waits for room; what the writer logs meanwhile does not."""
+    logger = logging.getLogger("horus.recording")
+
+    def work() -> None:
+        goes_on.wait(PATIENCE_S)
+        logger.error("something to tell")
+
+    goes_on = threading.Event()
+    simulated.recorder.do_soon(work)
+    time.sleep(0.1)  # until it is at it
+
+    def send_and_log() -> None:
+        for _ in range(2 * ROOM):
+            logger.info("as the nodes do")
+
+    level = logger.level
+    logger.setLevel(logging.INFO)
+    try:
+        sender = threading.Thread(target=send_and_log)
+        sender.start()
+        sender.join(0.2)
+        assert sender.is_alive()
+        goes_on.set()
+        sender.join(PATIENCE_S)
+        assert not sender.is_alive()
+    finally:
+        logger.setLevel(level)
+    simulated.finish()
+    assert simulated.recorder.lost == 0
+
+
+def test_what_is_told_of_many_chunks_is_not_kept_in_memory(tmp_path: Path) -> None:
+    """A robot records for weeks, ten chunks a second."""
+    count = 20_000
+    definitions = Definitions()
+    for channel in range(20):
+        definitions.define(Channel(channel, f"topic_{channel}", "", {}, 0))
+    summary = Summary(definitions, tmp_path)
+    entry = chunk_index(Chunk("zstd", b"", 5, 1, 0, 0), 0, 0)
+    entry.message_index_offsets = dict.fromkeys(range(20), 1)
+    tracemalloc.start()
+    try:
+        for _ in range(count):
+            summary.add_chunk(entry, {0: [1, 0]})
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 3_000_000
+    assert summary.message_count == count
+    assert sum(map(len, summary.end(0))) > 200 * count
+    assert not list(tmp_path.iterdir())
+    summary.close()
