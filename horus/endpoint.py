@@ -52,16 +52,17 @@ def parse_endpoint(value: object) -> Endpoint | None:
 
     if not isinstance(value, str) or not value or not value.isprintable():
         raise ConfigError("telemetry", value, f"must be a URL: {_SCHEMES}")
+    shown = value.rpartition("@")[2]  # messages end up in logs
     try:
         url = urlsplit(value)
+        shown = value.replace(f":{url.password}@", ":***@") if url.password else value
         port = url.port
     except ValueError as exc:
-        raise ConfigError("telemetry", value, f"is no URL: {exc}") from exc
-    shown = value.replace(f":{url.password}@", ":***@") if url.password else value
+        raise ConfigError("telemetry", shown, f"is no URL: {exc}") from exc
     scheme = url.scheme.lower()
     if scheme in ("http", "https", "otlp+http", "otlp+https"):
         if not url.hostname:
-            raise ConfigError("telemetry", value, "names no host")
+            raise ConfigError("telemetry", shown, "names no host")
         target = value[len(scheme) - len(scheme.removeprefix("otlp+")) :]
         if scheme in ("http", "https"):
             return Endpoint(shown, Kind.PUSH, url=target)
@@ -70,14 +71,14 @@ def parse_endpoint(value: object) -> Endpoint | None:
         return Endpoint(shown, Kind.OTLP, url=target)
     if scheme == "prometheus":
         if url.path not in ("", "/", "/metrics"):
-            raise ConfigError("telemetry", value, "serves /metrics; leave the path out")
+            raise ConfigError("telemetry", shown, "serves /metrics; leave the path out")
         listen = _PROMETHEUS_PORT if port is None else port
         return Endpoint(shown, Kind.SCRAPE, host=url.hostname or "127.0.0.1", port=listen)
     if scheme == "file":
         if url.netloc or not url.path.startswith("/") or url.path.endswith("/"):
-            raise ConfigError("telemetry", value, "must be file:///an/absolute/path.jsonl")
+            raise ConfigError("telemetry", shown, "must be file:///an/absolute/path.jsonl")
         return Endpoint(shown, Kind.APPEND, path=Path(url.path))
-    raise ConfigError("telemetry", value, f"is of a scheme that is not known: {_SCHEMES}")
+    raise ConfigError("telemetry", shown, f"is of a scheme that is not known: {_SCHEMES}")
 
 
 _SCHEMES = (

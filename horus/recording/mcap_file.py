@@ -275,7 +275,7 @@ class AppendedFile:
                 while rest:
                     written = os.pwrite(self._descriptor, rest, end)
                     rest, end = rest[written:], end + written
-        except OSError:
+        except BaseException:
             # Half a chunk is of no use, and in the way of the next.
             os.ftruncate(self._descriptor, start)
             raise

@@ -219,10 +219,9 @@ class Recorder:
     def _put(self, item: Item, node: str, size: int = 0) -> None:
         if not self._recording:
             return
-        if self._has_no_room():
-            if threading.current_thread() is self._thread:
-                pass  # It has something to tell, or runs the application's code: who else writes?
-            elif self._timeline.deterministic or node in self.patient:
+        # Who writes does not wait for itself: it logs, and runs code of the application.
+        if self._has_no_room() and threading.current_thread() is not self._thread:
+            if self._timeline.deterministic or node in self.patient:
                 self._wait_for_room()
             else:
                 with self._lock:

@@ -297,3 +297,20 @@ def test_a_password_is_not_logged(caplog):
     make(f"http://me:secret@127.0.0.1:{free_port()}/x").run(duration=0.2)
     assert "me:***@127.0.0.1" in caplog.text
     assert "secret" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    "telemetry",
+    [
+        "mqtt://me:secret@host",
+        "http://me:secret@host:99999/",
+        "http://me:secret@[host/",
+        "file://me:secret@host/x",
+        "prometheus://me:secret@host/x",
+    ],
+)
+def test_a_password_is_not_in_the_error(telemetry):
+    """Errors of a configuration end up in logs, too."""
+    with pytest.raises(ConfigError) as caught:
+        Scheduler(telemetry=telemetry)
+    assert "secret" not in str(caught.value)
