@@ -28,7 +28,7 @@ class RtThread(NodeThread):
         if somebody earlier in order is due at the same instant and not done:
             sleep until that one passes the baton, or until it is time to go alone
         else sleep until shortly before the release, and spin until it comes
-        if late by a period or more: skip to the latest release, and count
+        if late by a period or more: skip to the latest release, once, and count
         tick
         pass the baton to whoever waits for it
 
@@ -73,6 +73,7 @@ class RtThread(NodeThread):
         self._timeline = live.timeline
         self._now_ns = live.timeline.now_ns
         self._index = 0
+        self._has_skipped = False
         self._release_ns = 0
         self._violated_ns = clock.NEVER
         self._pardoned_ns = clock.NEVER
@@ -96,6 +97,7 @@ class RtThread(NodeThread):
             if predecessor.done_ns < release_ns and self._wait_for_baton(
                 predecessor, release_ns, now_ns
             ):
+                self._has_skipped = False
                 return
         ahead_ns = release_ns - now_ns
         if ahead_ns > self._lead_ns:
@@ -105,11 +107,14 @@ class RtThread(NodeThread):
             return
         while now_ns < release_ns:
             now_ns = self._now_ns()
-        if now_ns - release_ns >= self.live.period_ns:
+        # Not twice without a tick: of a period of microseconds, the next is over by now, too.
+        if now_ns - release_ns >= self.live.period_ns and not self._has_skipped:
             latest = self.grid.index_at(min(now_ns, self._timeline.end_ns - 1))
             if latest > self._index:
                 self._skip_to(latest)
+                self._has_skipped = True
                 return
+        self._has_skipped = False
         self._run_tick(release_ns)
         self._hand_over(release_ns)
         self._move_to(self._index + 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Callable
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from horus import ConfigError, HorusError, Node, Scheduler, Sub, TopicError, UnknownNodeError
+from horus.timing import ReleaseGrid
 
 from .helpers import KINDS, node_of, nothing, run_until
 
@@ -571,6 +573,23 @@ def test_extreme_rates_that_are_accepted_work_in_real_time(make, loop, kind, rat
         assert sched.get_node_stats("node")["state"] == "stopped"
     else:
         assert refused.argument == "rate"
+
+
+@pytest.mark.realtime
+def test_a_machine_too_slow_for_the_period_still_ticks(make, monkeypatch):
+    """Finding the latest release takes longer than a period: it is not looked for for ever."""
+    index_at = ReleaseGrid.index_at
+
+    def slow(grid, instant_ns):
+        time.sleep(50e-6)
+        return index_at(grid, instant_ns)
+
+    monkeypatch.setattr(ReleaseGrid, "index_at", slow)
+    ticks = []
+    sched = make()
+    sched.add(node_of("Rt", "node", lambda node: ticks.append(1), rate=1e6))
+    run_until(sched, lambda: len(ticks) > 10)
+    assert sched.get_node_stats("node")["skipped"] > 0
 
 
 @settings(deadline=None, max_examples=40)
