@@ -569,7 +569,7 @@ def test_a_frozen_worker_is_killed_and_comes_back(make, caplog):
             "worker",
             tick,
             pubs=["out"],
-            watchdog=100 * ms,
+            watchdog=500 * ms,  # a slow machine holds up a good tick, too
             safe_state=lambda node: node.send("hook", ("hook", os.getpid())),
         )
     )
