@@ -223,17 +223,17 @@ def _dump(ring: Ring, directory: Path) -> Path:
     try:
         file = mcap_file.AppendedFile(descriptor)
         mcap_file.begin(file)
-        definitions = mcap_file.Definitions()
-        with contextlib.closing(mcap_file.Summary(definitions, directory)) as summary:
+        summary = mcap_file.Summary(mcap_file.Definitions(), directory)
+        with contextlib.closing(summary):
             for record in ring.records():
                 # What is damaged after a power cut costs itself only.
                 with contextlib.suppress(ValueError):
                     if record[0] != Opcode.CHUNK:
                         continue
                     content = record[RECORD_HEAD.size :]
-                    chunk, defined, index = recovery.survey_chunk(content)
-                    for definition in defined:
-                        definitions.define(definition)
+                    chunk, definitions, index = recovery.survey_chunk(content)
+                    for definition in definitions:
+                        summary.definitions.define(definition)
                     mcap_file.append_chunk(file, summary, chunk, index)
             file.append_all(summary.end(file.size))
         file.sync()

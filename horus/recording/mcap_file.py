@@ -88,7 +88,7 @@ class Summary:
             definitions: The schemas and channels that its chunks refer to.
             directory: Where a file without a name may be kept.
         """
-        self._definitions = definitions
+        self.definitions = definitions
         self._counts: Counter[int] = Counter()
         self._first_ns, self._last_ns, self._chunks = FOREVER_NS, 0, 0
         self._entries = tempfile.SpooledTemporaryFile(  # noqa: SIM115 - until close
@@ -144,8 +144,8 @@ class Summary:
         self._entries.close()
 
     def _groups(self) -> Iterator[tuple[Opcode, Iterable[bytes]]]:
-        yield Opcode.SCHEMA, map(packed, self._definitions.schemas.values())
-        yield Opcode.CHANNEL, map(packed, self._definitions.channels.values())
+        yield Opcode.SCHEMA, map(packed, self.definitions.schemas.values())
+        yield Opcode.CHANNEL, map(packed, self.definitions.channels.values())
         yield Opcode.STATISTICS, [packed(self._statistics())]
         self._entries.seek(0)
         yield Opcode.CHUNK_INDEX, iter(lambda: self._entries.read(_MOST_IN_MEMORY), b"")
@@ -153,14 +153,14 @@ class Summary:
     def _statistics(self) -> Statistics:
         return Statistics(
             attachment_count=0,
-            channel_count=len(self._definitions.channels),
+            channel_count=len(self.definitions.channels),
             channel_message_counts=dict(self._counts),
             chunk_count=self._chunks,
             message_count=self.message_count,
             metadata_count=0,
             message_start_time=self._first_ns if self._chunks else 0,
             message_end_time=self._last_ns,
-            schema_count=len(self._definitions.schemas),
+            schema_count=len(self.definitions.schemas),
         )
 
 

@@ -79,11 +79,11 @@ def open_recording(path: str | os.PathLike[str]) -> RecordingReader:
 
 
 def _recover(path: Path, descriptor: int) -> Recovery:
-    definitions = mcap_file.Definitions()
-    with contextlib.closing(mcap_file.Summary(definitions, path.parent)) as summary:
+    summary = mcap_file.Summary(mcap_file.Definitions(), path.parent)
+    with contextlib.closing(summary):
         with reader.open_file(path) as file:
             size = os.fstat(descriptor).st_size
-            found = _survey(file, definitions, summary)
+            found = _survey(file, summary)
         finished = sessions.state_of(path) == "finished"
         dropped = 0
         if found.damaged or not finished:
@@ -118,9 +118,7 @@ class _Survey:
     """The last chunk, if its index is cut short."""
 
 
-def _survey(
-    file: BinaryIO, definitions: mcap_file.Definitions, summary: mcap_file.Summary
-) -> _Survey:
+def _survey(file: BinaryIO, summary: mcap_file.Summary) -> _Survey:
     found = _Survey()
     chunk: tuple[ChunkIndex, mcap_file.Index] | None = None
     for record in reader.records(file):
@@ -128,13 +126,13 @@ def _survey(
             if chunk is not None:
                 summary.add_chunk(*chunk)
             try:
-                head, defined, index = survey_chunk(record.content)
+                head, definitions, index = survey_chunk(record.content)
             except ValueError:
                 found.damaged.append(record)
                 chunk = None
             else:
-                for definition in defined:
-                    definitions.define(definition)
+                for definition in definitions:
+                    summary.definitions.define(definition)
                 length = record.end - record.offset
                 chunk = mcap_file.chunk_index(head, record.offset, length), index
         elif record.opcode == Opcode.MESSAGE_INDEX and chunk is not None:

@@ -32,7 +32,6 @@ from horus.recording.scribe import ENVELOPE
 from horus.recording.session_file import SessionFile
 from horus.topics import Bus
 
-LOG = "horus/log"
 ROOM = 100
 """Items that may wait in these tests."""
 PATIENCE_S = 10.0
@@ -74,11 +73,11 @@ class Disk:
             if entry.channel.topic == "count"
         ]
 
+    def facts(self, channel: str) -> list[dict[str, str]]:
+        return [json.loads(bytes(e.data)) for e in self.entries() if e.channel.topic == channel]
+
     def losses(self) -> list[str]:
-        events = [
-            json.loads(bytes(e.data)) for e in self.entries() if e.channel.topic == "horus/events"
-        ]
-        return [event["text"] for event in events if event["kind"] == "lost"]
+        return [fact["text"] for fact in self.facts("horus/events") if fact["kind"] == "lost"]
 
 
 class Rig:
@@ -310,8 +309,7 @@ def test_a_log_record_of_any_text_is_recorded(live: Rig, text: str) -> None:
     live.send(3)
     live.finish()
     assert live.disk.messages() == [1, 2, 3]
-    logs = [json.loads(bytes(e.data)) for e in live.disk.entries() if e.channel.topic == LOG]
-    assert [log["message"] for log in logs] == [text.replace("\udc80", "?")]
+    assert [log["message"] for log in live.disk.facts("horus/log")] == [text.replace("\udc80", "?")]
 
 
 def test_a_record_that_cannot_be_put_in_words_does_not_harm_who_logs(
@@ -327,7 +325,7 @@ def test_a_record_that_cannot_be_put_in_words_does_not_harm_who_logs(
     logger = logging.getLogger("horus.node.it")
     logger.handle(logger.makeRecord(logger.name, logging.ERROR, "f", 1, Odd(), (), None))
     live.finish()
-    (log,) = [json.loads(bytes(e.data)) for e in live.disk.entries() if e.channel.topic == LOG]
+    (log,) = live.disk.facts("horus/log")
     assert "Odd whose repr raised ZeroDivisionError" in log["message"]
 
 
