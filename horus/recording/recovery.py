@@ -58,7 +58,7 @@ def recover(path: str | os.PathLike[str]) -> Recovery:
     except OSError as exc:
         raise RecordingError(f"{where} cannot be recovered: {exc}") from exc
     try:
-        if not sessions.lock(descriptor):
+        if not sessions.lock(descriptor, wait=True):
             raise RecordingError(f"{where} is being recorded; stop that first")
         return _recover(where, descriptor)
     except OSError as exc:

@@ -6,6 +6,7 @@ import contextlib
 import datetime as dt
 import os
 import re
+import time
 from pathlib import Path
 
 import platformdirs
@@ -49,11 +50,7 @@ class RecordedSession(str):
 def default_directory() -> Path:
     """Return where recordings go: under `HORUS_HOME`, else the user's data directory."""
     home = os.environ.get("HORUS_HOME")
-    return (
-        Path(home) / "recordings"
-        if home
-        else platformdirs.user_data_path("horus", False) / ("recordings")
-    )
+    return (Path(home) if home else platformdirs.user_data_path("horus", False)) / "recordings"
 
 
 def create(directory: Path, kind: str = "session", suffix: str = SUFFIX) -> tuple[Path, int]:
@@ -70,8 +67,10 @@ def create(directory: Path, kind: str = "session", suffix: str = SUFFIX) -> tupl
         path = directory / f"{name}{suffix}"
         with contextlib.suppress(FileExistsError):
             descriptor = mcap_file.create(path)
-            lock(descriptor, wait=True)
-            return path, descriptor
+            if lock(descriptor, wait=True):
+                return path, descriptor
+            os.close(descriptor)
+            path.unlink()
     raise FileExistsError(f"there are 1000 sessions called {stem} in {directory}")
 
 
@@ -80,12 +79,21 @@ def lock(descriptor: int, *, wait: bool = False) -> bool:
 
     Args:
         descriptor: The file.
-        wait: Whether to wait for others to be done with it. With a new file that is for those
-            who look at how it stands, and takes no time.
+        wait: Whether to wait, at most 50 ms, for those who only look at how a session stands:
+            each of them holds a lock for an instant.
     """
+    for _ in range(50 if wait else 1):
+        if _flock(descriptor):
+            return True
+        if wait:
+            time.sleep(0.001)
+    return False
+
+
+def _flock(descriptor: int, *, shared: bool = False) -> bool:
     if fcntl is not None:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         except OSError:
             return False
     return True
@@ -99,7 +107,7 @@ def state_of(path: Path) -> str:
             file.seek(max(0, size - len(MCAP0_MAGIC)))
             if size > 2 * len(MCAP0_MAGIC) and file.read() == MCAP0_MAGIC:
                 return "finished"
-            return "unfinished" if lock(file.fileno()) else "recording"
+            return "unfinished" if _flock(file.fileno(), shared=True) else "recording"
     except OSError:
         return "unfinished"
 
@@ -107,10 +115,15 @@ def state_of(path: Path) -> str:
 def sessions(directory: Path) -> list[RecordedSession]:
     """Return all sessions of a directory, the oldest first."""
     try:
-        paths = sorted(directory.glob(f"*{SUFFIX}"), key=lambda path: path.stem)
+        paths = sorted(directory.glob(f"*{SUFFIX}"), key=_age)
     except OSError:
         return []
     return [RecordedSession(path) for path in paths if path.is_file()]
+
+
+def _age(path: Path) -> tuple[list[int], str]:
+    """Return what sorts sessions by the moment in their names: `…_10` is younger than `…_2`."""
+    return [int(digits) for digits in re.findall(r"\d+", path.stem)], path.stem
 
 
 def find(name: object, directory: Path) -> RecordedSession:

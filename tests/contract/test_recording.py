@@ -281,13 +281,12 @@ def test_recording_can_be_stopped_mid_run(tmp_path):
 
 
 def test_each_run_is_a_session_of_its_own(tmp_path):
-    """Two runs make two files, even within a second."""
+    """Two runs make two files."""
     sched = Scheduler(tick_rate=100, recording=tmp_path)
     sched.add(Node("count", counting(), rate=100, pubs=["count"]))
     for _ in range(2):
         sched.run(duration=0.1)
     first, second = sched.list_recordings()
-    assert second.startswith(first)
     assert read(first.path, "count")[-1] + 1 == read(second.path, "count")[0]
 
 
