@@ -3,8 +3,8 @@
 Everything here concerns the calling thread or the whole process, raises OSError
 where the kernel refuses, and does nothing on its own account.
 
-Source: timerfd_create(2), sched(7), sched_setaffinity(2), setpriority(2), mlockall(2),
-PR_SET_TIMERSLACK in prctl(2), /sys/devices/system/cpu/isolated.
+Source: timerfd_create(2), sem_clockwait(3), sched(7), sched_setaffinity(2), setpriority(2),
+mlockall(2), PR_SET_TIMERSLACK in prctl(2), /sys/devices/system/cpu/isolated.
 """
 
 from __future__ import annotations
@@ -76,6 +76,59 @@ class TimerFd:
     def close(self) -> None:
         """Give the descriptor back."""
         os.close(self.fd)
+
+
+class Semaphore:
+    """A binary semaphore for which a thread waits until an absolute instant.
+
+    The locks of `threading` take a timeout, and tell the kernel of it once other threads have
+    let them: the sleep is too long by what those have computed meanwhile.
+
+    Raises:
+        OSError: The platform has no sem_clockwait.
+    """
+
+    def __init__(self) -> None:
+        """Begin with none given."""
+        libc, kept = _libc_of_semaphores()
+        # A sem_t, which is four longs everywhere.
+        self._memory = (ctypes.c_ulong * 4)()
+        self._semaphore = ctypes.byref(self._memory)
+        self._until = _Timespec()
+        self._pointer = ctypes.byref(self._until)
+        self._given = False
+        self._wait, self._wait_until, self._post = libc.sem_wait, libc.sem_clockwait, kept.sem_post
+        libc.sem_init(self._semaphore, 0, 0)
+
+    def give(self) -> None:
+        """Wake who waits, or let the next one not wait. Thread: any."""
+        # Who has just taken it and not said so yet looks at what there is to do after this.
+        if not self._given:
+            self._given = True
+            self._post(self._semaphore)
+
+    def take(self, until_ns: int | None = None) -> bool:
+        """Wait, at most until an instant on CLOCK_MONOTONIC [ns]; return whether it was given."""
+        if until_ns is None:
+            failed = self._wait(self._semaphore)
+        else:
+            until = self._until
+            until.tv_sec, until.tv_nsec = divmod(until_ns, _NS_PER_S)
+            failed = self._wait_until(self._semaphore, time.CLOCK_MONOTONIC, self._pointer)
+        if failed:
+            return False
+        self._given = False
+        return True
+
+
+@functools.cache
+def _libc_of_semaphores() -> tuple[ctypes.CDLL, ctypes.PyDLL]:
+    """Return libc to wait with, and libc to call without giving the interpreter away."""
+    if sys.platform == "linux":
+        libc = ctypes.CDLL(None)
+        if hasattr(libc, "sem_clockwait"):  # glibc 2.30
+            return libc, ctypes.PyDLL(None)
+    raise OSError("sem_clockwait is not available on this platform")
 
 
 def run_fifo(priority: int, *, inherited: bool = False) -> None:

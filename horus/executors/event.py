@@ -156,7 +156,7 @@ class EventThread(NodeThread):
         delay_ns = self.live.resume_after_ns()
         if delay_ns:
             # Restarting: the messages wait, and are not lost to the back-off.
-            self.park(delay_ns)
+            self.park(self.live.timeline.now_ns() + delay_ns)
             return
         before = EventTick(self.live)
         self._run_tick(arrivals.next_release_ns())

@@ -99,11 +99,11 @@ class RtThread(NodeThread):
             ):
                 self._has_skipped = False
                 return
-        ahead_ns = release_ns - now_ns
-        if ahead_ns > self._lead_ns:
+        wake_up_ns = release_ns - self._lead_ns
+        if now_ns < wake_up_ns:
             # Woken early or for a job, we come back here and look again.
-            if not self.park(ahead_ns - self._lead_ns):
-                self._learn_lead(self._now_ns() - (release_ns - self._lead_ns))
+            if not self.park(wake_up_ns):
+                self._learn_lead(self._now_ns() - wake_up_ns)
             return
         while now_ns < release_ns:
             now_ns = self._now_ns()
@@ -180,7 +180,7 @@ class RtThread(NodeThread):
         self.live.waited_until_ns = limit_ns
         # Looked at again now that the predecessor can see us.
         if predecessor.done_ns < release_ns:
-            self.park(limit_ns - now_ns)
+            self.park(limit_ns)
         self.live.waited_until_ns = min(self._now_ns(), limit_ns)
         return True
 
@@ -219,9 +219,9 @@ class RtThread(NodeThread):
     def _enter_real_time(self) -> None:
         self.priority = self._real_time.enter_node_thread(self.live)
 
-    def park(self, timeout_ns: int | None = None) -> bool:
+    def park(self, until_ns: int | None = None) -> bool:
         """Sleep; see `NodeThread`. What `_hand_over` has raised ends with it."""
-        woken = super().park(timeout_ns)
+        woken = super().park(until_ns)
         if self._inherited:
             self._inherited = False
             self._change_priority(self.priority)

@@ -10,9 +10,9 @@ from concurrent.futures import Future
 from typing import Generic, TypeVar
 
 from horus.executors.base import run_into
+from horus.executors.permit import make_permit
 from horus.live import LiveNode
 from horus.loop.stacks import Stack, stack_of_thread
-from horus.units import to_s
 
 T = TypeVar("T", bound="NodeThread")
 
@@ -38,11 +38,9 @@ class NodeThread(threading.Thread):
         self._jobs: deque[Callable[[], None]] = deque()
         self._closing = False
         self._broken = False
-        # A lock as a binary semaphore. Waiting for it with a timeout sleeps as
-        # exactly as clock_nanosleep (sem_clockwait on CLOCK_MONOTONIC), and,
-        # unlike a sleep, ends when there is something to do.
-        self._parked = threading.Lock()
-        self._parked.acquire()
+        # Waiting for it is as exact as clock_nanosleep and, unlike that, ends when
+        # there is something to do.
+        self._permit = make_permit()
 
     def post(self, job: Callable[[], None]) -> None:
         """Run `job` after what is in progress."""
@@ -62,14 +60,11 @@ class NodeThread(threading.Thread):
 
     def unpark(self) -> None:
         """Wake the thread, or keep it from parking the next time."""
-        try:
-            self._parked.release()
-        except RuntimeError:
-            pass  # woken already
+        self._permit.give()
 
-    def park(self, timeout_ns: int | None = None) -> bool:
-        """Sleep until woken, for at most `timeout_ns` [ns]; return whether woken."""
-        return self._parked.acquire(True, -1 if timeout_ns is None else to_s(timeout_ns))
+    def park(self, until_ns: int | None = None) -> bool:
+        """Sleep until woken, at most until an instant [ns]; return whether woken."""
+        return self._permit.take(until_ns)
 
     def run(self) -> None:
         """Serve until closed, whatever happens: `shutdown()` is to run here, too."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import sys
 import threading
@@ -12,7 +13,7 @@ from typing import Any, Protocol, TypeVar
 import zstandard
 from mcap.records import Chunk
 
-from horus import clock
+from horus import clock, os_rt
 from horus.clock import FOREVER_NS, NEVER, Timeline
 from horus.live import NoteTick
 from horus.logs import readable
@@ -124,6 +125,7 @@ class Recorder:
         self._chunks = _Chunks(flush_ns)
         self._scribe = Scribe(self._chunks, timeline.wall_offset_ns)
         self._configuration: dict[tuple[str, str], Fact] = {}
+        self._run_first = False
         self._refresh_size: int | None = None
         self._refreshed_at = 0
         self._handler = _LogHandler(self.note_log)
@@ -140,13 +142,18 @@ class Recorder:
         """How many items were dropped, because writing them did not keep up or failed."""
         return self._lost + self._unwritable + sum(sink.lost for sink in self._chunks.sinks)
 
-    def start(self, sinks: Iterable[Sink], refresh_size: int | None = None) -> None:
+    def start(
+        self, sinks: Iterable[Sink], refresh_size: int | None = None, *, run_first: bool = False
+    ) -> None:
         """Write to sinks, which it owns from now on.
 
         Args:
             sinks: Where chunks go.
             refresh_size: After so many bytes the configuration is written again.
+            run_first: Whether to see that no other program takes the core of the thread that
+                writes, which would keep the interpreter from real-time threads meanwhile.
         """
+        self._run_first = run_first
         self._chunks.sinks.extend(sinks)
         self._refresh_size = refresh_size
         logging.getLogger("horus").addHandler(self._handler)
@@ -297,6 +304,9 @@ class Recorder:
             )
 
     def _write(self) -> None:
+        if self._run_first:
+            with contextlib.suppress(OSError):  # `degradations()` tells of it
+                os_rt.run_first()
         try:
             while not self._ending.is_set():
                 self._give_way(nap_ns=_DRAIN_PERIOD_NS)

@@ -82,7 +82,11 @@ class Recordings:
         sinks = [sink for sink in (self._file, self._blackbox) if sink is not None]
         if not sinks:
             return
-        recorder.start(sinks, self._blackbox.refresh_size if self._blackbox else None)
+        recorder.start(
+            sinks,
+            self._blackbox.refresh_size if self._blackbox else None,
+            run_first=self._spec.rt and not self._timeline.deterministic,
+        )
         self._recorder, self._timed = recorder, []
         recorder.grids = self._grids
         # A program that ends without ending its session should not leave half a file.

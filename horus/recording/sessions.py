@@ -6,7 +6,7 @@ import contextlib
 import datetime as dt
 import os
 import re
-import time
+import threading
 from pathlib import Path
 
 import platformdirs
@@ -86,7 +86,7 @@ def lock(descriptor: int, *, wait: bool = False) -> bool:
         if _flock(descriptor):
             return True
         if wait:
-            time.sleep(0.001)
+            threading.Event().wait(0.001)
     return False
 
 

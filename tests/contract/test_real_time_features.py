@@ -64,6 +64,30 @@ def test_rt_enables_sched_fifo_for_all_rt_class_nodes():
 
 
 @needs_permission
+@pytest.mark.parametrize(("rt", "niceness"), [(True, -20), (False, 0)])
+def test_no_other_program_takes_the_core_of_who_has_the_interpreter(rt, niceness, tmp_path):
+    """The event loop, compute nodes and the thread that records run at nice -20, with rt=True."""
+    found = {}
+
+    def look(name, thread_id):
+        found[name] = os.getpriority(os.PRIO_PROCESS, thread_id)
+
+    def best():
+        look("best", threading.get_native_id())
+        (recorder,) = (
+            thread for thread in threading.enumerate() if thread.name == "horus-recorder"
+        )
+        look("recorder", recorder.native_id)
+
+    sched = Scheduler(rt=rt, recording=tmp_path)
+    sched.add(Node("rt", lambda: None, rate=100))
+    sched.add(Node("best", best))
+    sched.add(Node("planner", lambda: look("planner", threading.get_native_id()), compute=True))
+    sched.run(0.3)
+    assert found == {"best": niceness, "recorder": niceness, "planner": niceness}
+
+
+@needs_permission
 def test_what_a_node_starts_does_not_inherit_its_priority():
     """A driver's helper thread or a subprocess gets ordinary scheduling, not the motor's."""
     seen = []

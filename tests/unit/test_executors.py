@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from unittest.mock import Mock
+import time
+from unittest.mock import MagicMock, Mock
 
 import pytest
 
 from horus import Node
-from horus.clock import SimClock, Timeline
+from horus.clock import MonotonicClock, SimClock, Timeline
 from horus.executors.compute import ComputeExecutor
 from horus.executors.event import ThreadEventExecutor
 from horus.executors.rt import RtExecutor, RtThread
 from horus.live import LiveNode
 from horus.loop.control import RunControl
+from horus.units import NS_PER_S
 
 NOTHING_DUE = Mock(due_ns=Mock(return_value=None))
 
@@ -95,3 +97,23 @@ def test_who_waits_for_an_rt_node_owes_its_tick_from_the_end_of_the_wait():
     cloud.tick_context.ticking = True
     assert executor._hold_up(cloud, 2 * release_ns, 2 * release_ns) is not None
     assert cloud.owed_from_ns == release_ns + 100
+
+
+def test_a_thread_held_up_on_its_way_to_sleep_does_not_oversleep():
+    """What others compute between its look at the clock and its sleep does not make it late."""
+    timeline = Timeline(MonotonicClock(), 1.0)
+    control = RunControl(None, lambda live, lasted_ns: None)
+    motor = RtThread(
+        LiveNode(Node("motor", lambda: None, rate=1), timeline, control, 0), Mock(spin_ns=0), Mock()
+    )
+    began_ns = timeline.now_ns()
+    motor.engage(began_ns + 1)
+    motor.park(0)
+
+    def hold_up():
+        time.sleep(1.1)
+        return iter(())
+
+    motor._awaited = MagicMock(__iter__=Mock(side_effect=hold_up))
+    motor.idle()
+    assert timeline.now_ns() - began_ns < 1.6 * NS_PER_S

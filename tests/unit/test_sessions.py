@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import time
 
 import pytest
 
@@ -82,7 +81,15 @@ def looker(monkeypatch):
 
 def test_a_session_looked_at_while_it_is_made_gets_its_lock(monkeypatch, moment, looker, tmp_path):
     """Whoever lists sessions at the wrong instant delays the new one a little."""
-    monkeypatch.setattr(time, "sleep", lambda seconds: os.close(looker.pop()))
+    flock = sessions._flock
+
+    def leave_after(descriptor, **options):
+        locked = flock(descriptor, **options)
+        if looker:
+            os.close(looker.pop())
+        return locked
+
+    monkeypatch.setattr(sessions, "_flock", leave_after)
     with session(tmp_path) as path:
         assert not path.stem.endswith("_2")
         assert sessions.state_of(path) == "recording"
