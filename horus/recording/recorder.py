@@ -28,10 +28,15 @@ from horus.units import NS_PER_MS, NS_PER_S, NS_PER_US, to_ns, to_s
 _log = logging.getLogger("horus.recording")
 T = TypeVar("T")
 
+_make: Any = tuple.__new__
+"""`_make(Tick, fields)` is `Tick(*fields)` in half the time."""
+
 MOST_UNWRITTEN = 65_536
 """Items that may wait to be written."""
 MOST_UNWRITTEN_BYTES = 256_000_000
 """How much large messages that wait to be written may come to [bytes]."""
+_FEW = 1024
+"""Below so many items it is not looked at whether there is room for another: there is."""
 _LARGE = 1024
 """From this size on a message is large [bytes]: `MOST_UNWRITTEN` bounds the others well enough."""
 _LONGEST_STALL_NS = 3 * NS_PER_S
@@ -175,9 +180,8 @@ class Recorder:
             size = sys.getsizeof(frozen[0])
         if size < _LARGE:
             size = 0
-        message = Message(
-            self._now_ns(), release_ns, cycle, publisher, publisher.sent, frozen, size
-        )
+        fields = (self._now_ns(), release_ns, cycle, publisher, publisher.sent, frozen, size)
+        message: Message = _make(Message, fields)
         self._put(message, node, size)
 
     def tick_noter(self, node: str) -> NoteTick:
@@ -192,19 +196,17 @@ class Recorder:
             past_deadline_ns: int,
             failed: bool,
         ) -> None:
-            put(
-                Tick(
-                    node,
-                    cycle_at(release_ns),
-                    release_ns,
-                    start_ns,
-                    finish_ns,
-                    over_budget_ns,
-                    past_deadline_ns,
-                    failed,
-                ),
+            fields = (
                 node,
+                cycle_at(release_ns),
+                release_ns,
+                start_ns,
+                finish_ns,
+                over_budget_ns,
+                past_deadline_ns,
+                failed,
             )
+            put(_make(Tick, fields), node)
 
         return note_tick
 
@@ -227,7 +229,11 @@ class Recorder:
         if not self._recording:
             return
         # Who writes does not wait for itself: it logs, and runs code of the application.
-        if self._has_no_room() and threading.current_thread() is not self._thread:
+        if (
+            (size or len(self._queue) >= _FEW)
+            and self._has_no_room()
+            and threading.current_thread() is not self._thread
+        ):
             if self._timeline.deterministic or node in self.patient:
                 self._wait_for_room()
             else:

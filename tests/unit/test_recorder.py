@@ -107,6 +107,12 @@ class Rig:
         self.recorder.finish()
 
 
+@pytest.fixture(autouse=True)
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have room looked for from the first item on."""
+    monkeypatch.setattr(module, "_FEW", 0)
+
+
 @pytest.fixture
 def live(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
     monkeypatch.setattr(module, "MOST_UNWRITTEN", ROOM)
@@ -162,6 +168,20 @@ def test_a_disk_that_stands_still_too_long_costs_new_messages_though_there_is_ro
     live.finish()
     assert live.recorder.lost == 3
     assert live.disk.messages() == [1, 5, 6]
+
+
+def test_the_first_few_items_of_a_long_standstill_are_kept(
+    live: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They cannot fill the memory, so nobody looks how long it has lasted."""
+    monkeypatch.setattr(module, "_FEW", 2)
+    monkeypatch.setattr(module, "_LONGEST_STALL_NS", 50_000_000)
+    live.stall()
+    time.sleep(0.2)
+    live.send(5)
+    assert live.recorder.lost == 3
+    live.finish()
+    assert live.disk.messages() == [1, 2, 3]
 
 
 def test_the_configuration_is_written_again_in_the_middle_of_a_backlog() -> None:
