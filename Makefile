@@ -23,8 +23,10 @@ lint: .venv/dev
 types: .venv/dev
 	$(BIN)/mypy
 
+# What asserts on real time runs by itself; all the rest, on all cores.
 pytest: .venv/dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -m "not realtime and not soak" --numprocesses auto --dist loadfile
+	$(BIN)/python -m pytest -m "realtime and not soak"
 
 soak: .venv/dev
 	$(BIN)/python -m pytest -m soak

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import inspect
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -183,3 +184,8 @@ def record_ticks(journal: list[Any], value: Callable[[], T]) -> Callable[[Node],
         journal.append(value())
 
     return tick
+
+
+def named(value):
+    """Return an id of a test that is the same in every process: without addresses."""
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))

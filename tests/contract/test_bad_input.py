@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from horus import ConfigError, HorusError, Node, Scheduler, Sub, TopicError, UnknownNodeError
 from horus.timing import ReleaseGrid
 
-from .helpers import KINDS, node_of, nothing, run_until
+from .helpers import KINDS, named, node_of, nothing, run_until
 
 NOT_A_NUMBER_OF_HZ = [0, 0.0, -1, -0.5, math.nan, math.inf, -math.inf, "100", True, [100], 1j]
 """Values that are no rate, budget or deadline, whatever else they are."""
@@ -33,7 +33,7 @@ def assert_refused(refused: pytest.ExceptionInfo, argument: str, value: object, 
 # -- Node ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rate", NOT_A_NUMBER_OF_HZ, ids=repr)
+@pytest.mark.parametrize("rate", NOT_A_NUMBER_OF_HZ, ids=named)
 def test_a_rate_must_be_a_finite_number_of_hz_above_zero(rate):
     """Rates that are NaN, inf, negative, zero or no number are refused."""
     with pytest.raises(ConfigError) as refused:
@@ -42,7 +42,7 @@ def test_a_rate_must_be_a_finite_number_of_hz_above_zero(rate):
 
 
 @pytest.mark.parametrize("argument", ["budget", "deadline", "watchdog"])
-@pytest.mark.parametrize("value", NOT_A_NUMBER_OF_HZ, ids=repr)
+@pytest.mark.parametrize("value", NOT_A_NUMBER_OF_HZ, ids=named)
 def test_limits_must_be_finite_numbers_of_seconds_above_zero(argument, value):
     """Budgets, deadlines and watchdogs that are no duration are refused."""
     with pytest.raises(ConfigError) as refused:
@@ -142,7 +142,7 @@ BAD_NAMES = [
 ]
 
 
-@pytest.mark.parametrize("name", BAD_NAMES, ids=repr)
+@pytest.mark.parametrize("name", BAD_NAMES, ids=named)
 def test_node_names_become_file_and_metric_names(name):
     """Node names are validated: letters, digits, `_`, `-` and `.`, no path tricks."""
     with pytest.raises(ConfigError) as refused:
@@ -150,7 +150,7 @@ def test_node_names_become_file_and_metric_names(name):
     assert_refused(refused, "name", name, "letters, digits")
 
 
-@pytest.mark.parametrize("topic", [name for name in BAD_NAMES if name is not None], ids=repr)
+@pytest.mark.parametrize("topic", [name for name in BAD_NAMES if name is not None], ids=named)
 @pytest.mark.parametrize("where", ["pubs", "subs", "on", "Sub", "publish", "subscribe"])
 def test_topic_names_with_path_separators_or_control_characters_are_refused(topic, where):
     """Topic names with path separators or control characters are refused where written."""
@@ -176,7 +176,7 @@ def test_ordinary_names_are_fine(name):
 
 
 @pytest.mark.parametrize("argument", ["pubs", "subs"])
-@pytest.mark.parametrize("value", [5, 1.5, object()], ids=repr)
+@pytest.mark.parametrize("value", [5, 1.5, object()], ids=named)
 def test_ports_of_another_kind_are_refused(argument, value):
     """pubs/subs that are no topics are refused, with what they may be."""
     with pytest.raises(ConfigError) as refused:
@@ -215,7 +215,7 @@ def test_an_unknown_argument_of_a_node_is_refused():
 # -- Scheduler -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tick_rate", [*NOT_A_NUMBER_OF_HZ, None], ids=repr)
+@pytest.mark.parametrize("tick_rate", [*NOT_A_NUMBER_OF_HZ, None], ids=named)
 def test_a_tick_rate_must_be_a_finite_number_of_hz_above_zero(tick_rate):
     """Tick rates that are NaN, inf, negative, zero or no number are refused."""
     with pytest.raises(ConfigError) as refused:
@@ -250,7 +250,7 @@ def test_max_deadline_misses_must_be_a_whole_number_above_zero(value):
 
 
 @pytest.mark.parametrize(
-    "cores", [[NO_SUCH_CORE], [-1], [0.5], [], "0", 0, ["0"], [True]], ids=repr
+    "cores", [[NO_SUCH_CORE], [-1], [0.5], [], "0", 0, ["0"], [True]], ids=named
 )
 def test_cores_must_exist(cores):
     """cores= must be a list of cores that this machine has."""
@@ -258,7 +258,7 @@ def test_cores_must_exist(cores):
         Scheduler(cores=cores)
 
 
-@pytest.mark.parametrize("name", [name for name in BAD_NAMES if name is not None], ids=repr)
+@pytest.mark.parametrize("name", [name for name in BAD_NAMES if name is not None], ids=named)
 def test_scheduler_names_are_checked_as_well(name):
     """Scheduler names become file names, too."""
     with pytest.raises(ConfigError) as refused:
@@ -282,7 +282,7 @@ def test_the_loop_must_be_one_of_two(loop):
     assert_refused(refused, "loop", loop, "'uvloop' or 'asyncio'")
 
 
-@pytest.mark.parametrize("value", list(NOT_A_NUMBER_OF_HZ), ids=repr)
+@pytest.mark.parametrize("value", list(NOT_A_NUMBER_OF_HZ), ids=named)
 def test_a_shutdown_timeout_must_be_a_duration(value):
     """shutdown_timeout= is a finite number of seconds above zero."""
     with pytest.raises(ConfigError) as refused:
@@ -300,14 +300,14 @@ def test_duplicate_names_are_refused_where_the_second_is_added(make):
     assert sched.get_node_info("motor") == 1
 
 
-@pytest.mark.parametrize("thing", [None, nothing, "motor", Node, [Node("a", nothing)]], ids=str)
+@pytest.mark.parametrize("thing", [None, nothing, "motor", Node, [Node("a", nothing)]], ids=named)
 def test_only_nodes_can_be_added(make, thing):
     """What is not a Node is refused by add()."""
     with pytest.raises(ConfigError, match="must be a Node"):
         make().add(thing)
 
 
-@pytest.mark.parametrize("duration", NOT_A_NUMBER_OF_HZ, ids=repr)
+@pytest.mark.parametrize("duration", NOT_A_NUMBER_OF_HZ, ids=named)
 @pytest.mark.parametrize("method", ["run", "tick_for"])
 def test_a_duration_must_be_a_finite_number_of_seconds_above_zero(make, method, duration):
     """Durations that are NaN, inf, negative, zero or no number are refused."""
@@ -335,7 +335,7 @@ def test_tick_for_needs_a_time(make):
     assert ticks == []
 
 
-@pytest.mark.parametrize("rate", [*NOT_A_NUMBER_OF_HZ, None], ids=repr)
+@pytest.mark.parametrize("rate", [*NOT_A_NUMBER_OF_HZ, None], ids=named)
 def test_set_node_rate_checks_its_rate(make, rate):
     """set_node_rate() refuses what Node(rate=...) refuses, and changes nothing then."""
     sched = make()
@@ -346,7 +346,7 @@ def test_set_node_rate_checks_its_rate(make, rate):
     assert sched.get_node_stats("node")["rate"] == 10
 
 
-@pytest.mark.parametrize("budget", [*NOT_A_NUMBER_OF_HZ, None], ids=repr)
+@pytest.mark.parametrize("budget", [*NOT_A_NUMBER_OF_HZ, None], ids=named)
 def test_set_tick_budget_checks_its_budget_in_microseconds(make, budget):
     """set_tick_budget() refuses what is no number of microseconds, and says microseconds."""
     sched = make()
@@ -356,7 +356,7 @@ def test_set_tick_budget_checks_its_budget_in_microseconds(make, budget):
     assert_refused(refused, "budget", budget, "microseconds")
 
 
-@pytest.mark.parametrize("timeout", [*NOT_A_NUMBER_OF_HZ, None], ids=repr)
+@pytest.mark.parametrize("timeout", [*NOT_A_NUMBER_OF_HZ, None], ids=named)
 def test_add_critical_node_checks_its_timeout(make, timeout):
     """add_critical_node() refuses a timeout that is no number of milliseconds."""
     sched = make()
@@ -379,7 +379,7 @@ USES_OF_A_NAME = {
 
 
 @pytest.mark.parametrize("use", USES_OF_A_NAME.values(), ids=USES_OF_A_NAME)
-@pytest.mark.parametrize("name", ["lidar", "", "motor "], ids=repr)
+@pytest.mark.parametrize("name", ["lidar", "", "motor "], ids=named)
 def test_unknown_names_are_errors_that_list_the_known_ones(make, use, name):
     """Unknown names are errors; the message lists the nodes there are."""
     sched = make(deterministic=True)
@@ -399,7 +399,7 @@ def test_unknown_names_are_errors_that_list_the_known_ones(make, use, name):
     ],
     ids=[*USES_OF_A_NAME, "has_node", "remove_node"],
 )
-@pytest.mark.parametrize("name", [None, 5, ["motor"]], ids=repr)
+@pytest.mark.parametrize("name", [None, 5, ["motor"]], ids=named)
 def test_names_that_are_no_strings_are_refused(make, use, name):
     """A name of a wrong type is refused, with the argument and the value."""
     sched = make(deterministic=True)
@@ -417,7 +417,7 @@ def test_asking_whether_a_node_exists_is_no_error(make):
     assert sched.remove_node("lidar") is False
 
 
-@pytest.mark.parametrize("names", ["motor", 42, 1.5, nothing], ids=repr)
+@pytest.mark.parametrize("names", ["motor", 42, 1.5, nothing], ids=named)
 @pytest.mark.parametrize("method", ["tick_once", "tick_for"])
 def test_names_must_be_a_list_of_names(make, method, names):
     """A selection that is no list of names is refused."""

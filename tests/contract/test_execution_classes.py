@@ -9,7 +9,7 @@ import pytest
 
 from horus import ConfigError, ExecutionClass, Node, ms, us
 
-from .helpers import nothing
+from .helpers import named, nothing
 
 
 async def tick_async(node: Node) -> None:
@@ -46,7 +46,7 @@ class AsyncCallable:
         ({"tick": functools.partial(tick_async), "rate": 1}, ExecutionClass.ASYNC_IO),
         ({"tick": AsyncCallable(), "rate": 1}, ExecutionClass.ASYNC_IO),
     ],
-    ids=str,
+    ids=named,
 )
 def test_the_execution_class_is_inferred_from_the_configuration(make, configuration, expected):
     """The scheduler assigns each node an execution class based on its configuration."""
@@ -84,7 +84,7 @@ def test_you_do_not_set_the_class_directly(argument):
         ({"compute": True, "tick": tick_async}, ["compute=True", "async", "def tick"]),
         ({"on": "scan", "rate": 10}, ["rate=10", "messages"]),
     ],
-    ids=str,
+    ids=named,
 )
 def test_contradicting_configurations_are_errors_that_say_why(configuration, words):
     """Compute with on, compute with async, and on with rate are errors that say why."""

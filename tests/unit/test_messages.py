@@ -52,7 +52,7 @@ def take(frozen: Any) -> tuple[Any, bool]:
     return fresh, fresh is payload
 
 
-@pytest.mark.parametrize("message", SAID, ids=repr)
+@pytest.mark.parametrize("message", SAID, ids=lambda message: type(message).__name__)
 def test_what_is_said_is_heard(message: Any) -> None:
     """The kind of message, its fields, and how receivers copy what was sent."""
     heard = messages.from_plain(pickle.loads(pickle.dumps(messages.to_plain(message), 5)))
