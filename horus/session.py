@@ -345,12 +345,13 @@ class Session:
     @contextlib.contextmanager
     def _driving(self, *, owns_process: bool, keeps_open: bool = False) -> Iterator[None]:
         """Run the nodes in the block, from the state before to the state after."""
-        self._take_charge()
-        self._idle.clear()
-        self._driving_thread = threading.get_ident()
         with contextlib.ExitStack() as around:
-            around.callback(self._become_idle)
+            # Before anything is recorded: that adds a handler, which shows nobody anything.
             around.enter_context(logs.visible(install=owns_process, verbose=self._spec.verbose))
+            self._take_charge()
+            self._idle.clear()
+            self._driving_thread = threading.get_ident()
+            around.callback(self._become_idle)
             if owns_process:
                 around.enter_context(
                     self.oversight.owning_process(

@@ -191,10 +191,15 @@ def recover_rings(directory: Path) -> list[Path]:
     """Write sessions of what dead processes have left in their rings; return the files."""
     recovered = []
     for path in sorted(directory.glob(f"*{SUFFIX}")):
-        with contextlib.suppress(FileNotFoundError):  # somebody else was faster
+        try:
             dumped = _recover_ring(path)
-            if dumped is not None:
-                recovered.append(dumped)
+        except FileNotFoundError:  # somebody else was faster
+            continue
+        except OSError as exc:
+            _log.error("%s cannot be recovered: %s; it is left alone", path, exc)
+            continue
+        if dumped is not None:
+            recovered.append(dumped)
     return recovered
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ import msgspec
 
 from horus.errors import RecordingError
 from horus.recording import encoding
-from horus.recording.reader import RecordedMessage
+from horus.recording.reader import RecordedMessage, set_of_names
 from horus.recording.recovery import open_recording
 from horus.snapshot import attributes, slots_of
 
@@ -65,27 +65,34 @@ def diff(
         classes: As for `Scheduler.replay_from`; only to name the field.
 
     Raises:
-        RecordingError: One is no recording, or damaged.
+        ConfigError: `topics` is no collection of names.
+        RecordingError: One is no recording, or damaged; neither has messages on such a topic.
     """
-    wanted = None if topics is None else frozenset(topics)
-    one, one_deterministic = _messages(a, wanted)
-    two, two_deterministic = _messages(b, wanted)
+    wanted = set_of_names("topics", topics)
+    one, one_deterministic = _messages(a)
+    two, two_deterministic = _messages(b)
+    known_topics = {topic for topic, _ in {**one, **two}}
+    for topic in sorted(wanted or ()):
+        if topic not in known_topics:
+            there_are = ", ".join(sorted(known_topics)) or "none"
+            raise RecordingError(
+                f"neither {a} nor {b} has messages on topic {topic!r}; there are: {there_are}"
+            )
     known = {encoding.name_of(kind): kind for kind in classes}
     exact = one_deterministic and two_deterministic
     found = (
         divergence
         for key in {**one, **two}
+        if wanted is None or key[0] in wanted
         if (divergence := _compare(one.get(key, []), two.get(key, []), exact, known)) is not None
     )
     return min(found, key=lambda each: each.tick, default=None)
 
 
-def _messages(
-    path: str | os.PathLike[str], topics: Collection[str] | None
-) -> tuple[Messages, bool]:
+def _messages(path: str | os.PathLike[str]) -> tuple[Messages, bool]:
     messages: Messages = defaultdict(list)
     with open_recording(path) as reader:
-        for message in reader.messages(topics):
+        for message in reader.messages():
             messages[message.topic, message.publisher].append(message)
         return dict(messages), bool(reader.about["deterministic"])
 

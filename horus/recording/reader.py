@@ -10,7 +10,7 @@ import io
 import os
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TypeVar
 
@@ -21,7 +21,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Header, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from horus.errors import RecordingError
+from horus.errors import ConfigError, RecordingError
 from horus.recording import encoding, sessions
 from horus.recording.mcap_file import COMPRESSION, MESSAGE_HEAD, PROFILE
 from horus.recording.scribe import ENVELOPE, EXACT, FORMAT, OUTSIDE
@@ -127,8 +127,12 @@ class RecordingReader:
         """Yield the messages of some topics, or of all, in the order in which they were sent.
 
         Raises:
+            ConfigError: `topics` is no collection of names.
             RecordingError: The file is damaged.
         """
+        return self._messages(set_of_names("topics", topics))
+
+    def _messages(self, topics: Collection[str] | None) -> Iterator[RecordedMessage]:
         for entry in self.entries():
             channel = entry.channel
             wanted = topics is None or channel.topic in topics
@@ -206,6 +210,19 @@ class RecordingReader:
             return msgspec.json.decode(data, type=dict[str, Any])
         except ValueError as exc:
             raise RecordingError(f"{self.path}: what {channel} says is damaged: {exc}") from exc
+
+
+def set_of_names(argument: str, names: Iterable[str] | None) -> frozenset[str] | None:
+    """Return names as a set; None stays None, which is for all.
+
+    Raises:
+        ConfigError: It is a single name, or nothing that has names.
+    """
+    if names is None:
+        return None
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise ConfigError(argument, names, f"must be a list of names, e.g. [{names!r}]")
+    return frozenset(names)
 
 
 def open_file(path: Path) -> BinaryIO:

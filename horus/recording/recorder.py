@@ -474,4 +474,20 @@ class _LogHandler(logging.Handler):
         """
         # In words now: its arguments may change.
         self._note(record, readable(record, self._format))
+        # Shown as it would be if nothing were recorded.
+        last = logging.lastResort
+        if last is not None and record.levelno >= last.level and self._is_alone(record):
+            last.handle(record)
         return True
+
+    def _is_alone(self, record: logging.LogRecord) -> bool:
+        """Return whether nobody shows the record, and no other recorder comes before this one."""
+        first: logging.Handler | None = None
+        logger: logging.Logger | None = logging.getLogger(record.name)
+        while logger is not None:
+            for handler in logger.handlers:
+                if not isinstance(handler, _LogHandler):
+                    return False
+                first = first or handler
+            logger = logger.parent if logger.propagate else None
+        return first is self

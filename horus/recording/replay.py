@@ -27,7 +27,7 @@ from horus.errors import ConfigError, RecordingError, StateError
 from horus.loop.pacer import Pacer
 from horus.node import Node
 from horus.recording import encoding
-from horus.recording.reader import RecordedMessage, RecordingReader
+from horus.recording.reader import RecordedMessage, RecordingReader, set_of_names
 from horus.recording.recovery import open_recording
 from horus.recording.scribe import EXACT
 from horus.spec import ExecutionClass
@@ -136,7 +136,7 @@ def _load(
     Raises:
         RecordingError: The file is no recording, is damaged, or lacks a node or a topic.
     """
-    wanted_nodes, wanted_topics = _names("nodes", nodes), _names("topics", topics)
+    wanted_nodes, wanted_topics = set_of_names("nodes", nodes), set_of_names("topics", topics)
     all_nodes: set[str] = set()
     all_topics: set[str] = set()
     tracks: dict[str, _Track] = {}
@@ -183,14 +183,6 @@ def _load(
     if not runs:
         runs.append((about["cycle"], about["epoch_ns"]))
     return _Recording(reader.path, about, runs, in_sequence, last_ns)
-
-
-def _names(argument: str, names: Iterable[str] | None) -> frozenset[str] | None:
-    if names is None:
-        return None
-    if isinstance(names, str) or not isinstance(names, Iterable):
-        raise ConfigError(argument, names, f"must be a list of names, e.g. [{names!r}]")
-    return frozenset(names)
 
 
 def _refuse_unknown(

@@ -262,3 +262,38 @@ def test_the_last_words_of_a_node_are_logged(make, caplog, loop):
     run_async(main(), loop)
 
     assert [r.getMessage() for r in records_of(caplog)] == ["last words"]
+
+
+@pytest.mark.parametrize(
+    "options", ["", "recording=True", "blackbox_mb=1", "recording=True, blackbox_mb=1"]
+)
+@pytest.mark.parametrize(
+    ("run", "shown"),
+    [
+        ("sched.run(duration=0.2)", ["told", "warned"]),
+        ("asyncio.run(sched.arun(duration=0.2))", ["warned"]),
+    ],
+    ids=["run", "arun"],
+)
+def test_recording_does_not_take_the_log_away(options, run, shown, tmp_path):
+    """Who has configured no logging sees of it what he sees without recording, and once."""
+    program = f"""
+        import asyncio
+        from horus import Node, Scheduler
+
+        def tick(node):
+            node.log_info("told")
+            node.log_warning("warned")
+            node.request_stop()
+
+        sched = Scheduler({options})
+        sched.add(Node("node", tick))
+        {run}
+    """
+    lines = run_program(program, HORUS_HOME=str(tmp_path)).stderr.splitlines()
+    said = [word for line in lines for word in ("told", "warned") if word in line]
+    assert said == shown
+    for path in tmp_path.rglob("session*.mcap"):
+        with horus.RecordingReader(path) as reader:
+            recorded = [fact["message"] for fact in reader.facts("horus/log")]
+        assert [text for text in recorded if text in ("told", "warned")] == shown

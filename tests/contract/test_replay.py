@@ -501,7 +501,19 @@ def test_a_missing_message_is_a_difference(tmp_path):
     assert (found.tick, found.field, found.a, found.b) == (2, "(missing)", 3, None)
     other = record_values(tmp_path / "c", [1, 2, 3], topic="u")
     assert horus.diff(first, other).field == "(missing)"
-    assert horus.diff(first, other, topics=["nothing"]) is None
+    assert horus.diff(first, first, topics=["t"]) is None
+
+
+def test_a_comparison_of_nothing_is_refused(tmp_path):
+    """A misspelt topic must not say that there is no difference."""
+    first = record_values(tmp_path / "a", [1, 2, 3])
+    second = record_values(tmp_path / "b", [1, 2])
+    with pytest.raises(RecordingError, match=r"topic 'tt'; there are: t$"):
+        horus.diff(first, second, topics=["t", "tt"])
+    with pytest.raises(ConfigError, match="list of names"):
+        horus.diff(first, second, topics="t")
+    with horus.RecordingReader(first) as reader, pytest.raises(ConfigError, match="list of names"):
+        reader.messages("t")
 
 
 def test_a_message_of_another_cycle_is_a_difference_in_virtual_time(tmp_path):

@@ -117,6 +117,15 @@ def test_what_is_no_ring_is_left_alone(content, tmp_path, caplog):
     assert str(path) in caplog.text
 
 
+def test_a_ring_that_cannot_be_opened_does_not_keep_others_from_being_recovered(tmp_path, caplog):
+    """Nor a new one from being made."""
+    (tmp_path / "a.ring").mkdir()
+    (tmp_path / "b.ring").write_bytes(b"")
+    assert recover_rings(tmp_path) == []
+    assert str(tmp_path / "a.ring") in caplog.text
+    assert str(tmp_path / "b.ring") in caplog.text
+
+
 def test_a_ring_needs_its_magic(descriptor):
     """Opening another file is refused."""
     os.write(descriptor, b"x" * 10_000)
