@@ -91,7 +91,7 @@ class ComputeExecutor(ThreadExecutor[ComputeThread]):
         thread = self.find_thread(live)
         super().dismiss(live)
         if isinstance(thread, WorkerThread):
-            thread.remote.kill()
+            thread.remote.dismiss()
             live.callbacks = live.core.callbacks
 
     def engage(self, live: LiveNode, from_ns: int) -> None:

@@ -133,16 +133,20 @@ class Channel:
         except (EOFError, OSError) as exc:
             raise pickle.UnpicklingError(describe(exc)) from exc
 
-    def close(self) -> None:
-        """Hang up: whoever waits at either end hears that the other one is gone.
-
-        Descriptors are given back once nobody uses them: their numbers may be another file's at
-        once. Somebody who does not notice, stuck in an object that is pickled, keeps them.
-        """
+    def hang_up(self) -> None:
+        """Let whoever waits at either end hear, after what was said, that the other is gone."""
         try:
             self._socket.shutdown(socket.SHUT_RDWR)
         except OSError:
             pass  # the other end was faster
+
+    def close(self) -> None:
+        """Hang up, and give back what it holds.
+
+        Descriptors are given back once nobody uses them: their numbers may be another file's at
+        once. Somebody who does not notice, stuck in an object that is pickled, keeps them.
+        """
+        self.hang_up()
         with contextlib.ExitStack() as stack:
             for lock in (self._sending, self._receiving):
                 if not lock.acquire(timeout=_LAST_STEPS_S):

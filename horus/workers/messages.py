@@ -40,8 +40,8 @@ class Setup(NamedTuple):
     """The node; see `pickling.pack`."""
     types: Mapping[str, type]
     """The types that topics have been declared with."""
-    newest: Inputs
-    """The newest message of each topic that the node receives."""
+    newest: Mapping[str, bytes | None]
+    """The newest message of each topic that the node receives, pickled: each may be lost alone."""
 
 
 class Call(NamedTuple):
@@ -58,6 +58,8 @@ class Done(NamedTuple):
     error: bytes | None
     queues: Sequence[tuple[str, int, int]]
     """Topics with how many messages were received of them in all, and how many wait."""
+    understood: bool = True
+    """Whether the call could be read; if not, nothing was run."""
 
 
 class Sent(NamedTuple):
@@ -80,15 +82,22 @@ class Stop(NamedTuple):
 
 
 class Open(NamedTuple):
-    """The callback receives from a topic it did not declare; answered with its newest message."""
+    """The callback receives from a topic it did not declare; the answer is its newest message."""
 
     topic: str
 
 
 class Fetch(NamedTuple):
-    """The worker does not know something of `__main__`; answered with it, by value."""
+    """The worker does not know something of `__main__`; the answer is that, by value."""
 
     name: str
+
+
+class Answer(NamedTuple):
+    """What was asked for, pickled, or why it cannot be had (see `pickling.pack_error`)."""
+
+    error: bytes | None
+    content: bytes | None
 
 
 _KINDS = (Call, Done, Sent, Logged, Stop, Open, Fetch)

@@ -26,7 +26,7 @@ from horus.tick_path import worker_died
 from horus.topics import Subscription
 from horus.workers import messages
 from horus.workers.channel import Channel
-from horus.workers.pickling import by_value, dumps, loads, pack, part, unpack_error
+from horus.workers.pickling import by_value, dumps, loads, pack, pack_error, part, unpack_error
 
 _CODE = (
     "import sys; sys.path.insert(0, sys.argv[1]); "
@@ -60,10 +60,19 @@ class WorkerProcess:
         self._on_end = on_end
         self._over = threading.Event()
         self._status = 0
-        self._stacks = os.memfd_create("horus-stacks") if hasattr(os, "memfd_create") else -1
+        self._stacks = -1
         self._looking = threading.Lock()
-        turns, their_turns = socket.socketpair()
-        aside, their_aside = socket.socketpair()
+        self.answers = False
+        """Whether it has said something: it can be asked for its stack from then on."""
+        with contextlib.ExitStack() as undo:
+            try:
+                turns, their_turns = map(undo.enter_context, socket.socketpair())
+                aside, their_aside = map(undo.enter_context, socket.socketpair())
+                if hasattr(os, "memfd_create"):
+                    self._stacks = os.memfd_create("horus-stacks")
+            except OSError as exc:
+                raise WorkerError(f"node {name!r}: no worker process can be had: {exc}") from exc
+            undo.pop_all()
         self.turns = Channel(turns, dumps, loads)
         self.aside = Channel(aside, dumps, loads)
         started: Future[subprocess.Popen[bytes]] = Future()
@@ -109,13 +118,13 @@ class WorkerProcess:
                 self._stacks = -1
 
     def stack(self) -> traceback.StackSummary | None:
-        """Return where its main thread is; None if it does not say in 10 ms.
+        """Return where its main thread is; None before it has said anything.
 
         Written by `faulthandler` in a signal handler: also of an extension that holds
         the interpreter.
         """
         with self._looking:
-            return None if self._stacks < 0 else self._look(self._stacks)
+            return self._look(self._stacks) if self.answers and self._stacks >= 0 else None
 
     def _look(self, file: int) -> traceback.StackSummary:
         # The two share a file offset.
@@ -163,6 +172,9 @@ class WorkerProcess:
         started.set_result(process)
         self._status = process.wait()
         self._over.set()
+        # A child of its may hold its ends of the sockets open.
+        self.turns.hang_up()
+        self.aside.hang_up()
         self._on_end(self)
 
 
@@ -189,6 +201,7 @@ class RemoteNode:
         self._real_time = real_time
         self._post = post
         self._process: WorkerProcess | None = None
+        self._dismissed = False
         self._turn = threading.Lock()
         self._aside = threading.Lock()
         self._received_before: dict[str, int] = {}
@@ -210,6 +223,11 @@ class RemoteNode:
         process = self._process
         if process is not None:
             process.kill()
+
+    def dismiss(self) -> None:
+        """End the worker at once, and have no other. Thread: any."""
+        self._dismissed = True
+        self.kill()
 
     def end(self) -> None:
         """End the worker, if there is one. Thread: any."""
@@ -240,16 +258,20 @@ class RemoteNode:
         live = self._live
         place = messages.Place(os.getpid(), sys.path, self._real_time.cores_of_worker(live))
         setup = self._setup(pack(live.core))
-        process = self._process = WorkerProcess(
-            live.name, lambda process: self._post(functools.partial(self._ended, process))
-        )
-        try:
-            process.turns.send(place)
-            process.turns.send(setup)
-            done, failed = self._listen(process.turns)
-        except (EOFError, OSError) as exc:
-            raise process.death() from exc
-        _raise_first(done, failed)
+        with self._turn:  # a safe-state hook that comes now goes aside
+            process = self._process = WorkerProcess(
+                live.name, lambda process: self._post(functools.partial(self._ended, process))
+            )
+            if self._dismissed:
+                raise WorkerError(f"node {live.name!r} was dismissed before its process had begun")
+            try:
+                process.turns.send(place)
+                process.turns.send(setup)
+                done, failed = self._listen(process.turns)
+            except (EOFError, OSError) as exc:
+                raise process.death() from exc
+            process.answers = True
+            _raise_first(done, failed)
 
     def _ended(self, process: WorkerProcess) -> None:
         """Act on the end of a worker, unless a callback has met it already."""
@@ -266,11 +288,13 @@ class RemoteNode:
 
     def _shutdown(self) -> None:
         """Run the node's `shutdown()`, unless its worker is gone, and end the worker."""
-        if self._process is not None:
-            try:
-                self._run("shutdown")
-            finally:
-                self.end()
+        if self._process is None:
+            self._live.emit(logging.WARNING, "no shutdown(): its worker process is gone")
+            return
+        try:
+            self._run("shutdown")
+        finally:
+            self.end()
 
     def _run(self, phase: str) -> None:
         """Run a callback in the worker.
@@ -300,13 +324,20 @@ class RemoteNode:
         inputs = self._inputs() if in_turn else ()
         call = messages.Call(phase, self._live.tick_context.moment(), inputs)
         try:
-            unsent = self._send(call, channel)
+            lost = self._send(call, channel)
             done, failed = self._listen(channel)
+            if phase != "tick" and not done.understood and done.error is not None:
+                lost = unpack_error(done.error)
+                self._send(call._replace(inputs=()), channel)
+                done, failed = self._listen(channel)
         except (EOFError, OSError) as exc:
             raise process.death() from exc
         if in_turn:
             self._count(done)
-        _raise_first(done, failed or unsent)
+        if lost is not None and phase != "tick":
+            self._live.emit(logging.WARNING, f"messages that waited for it are lost: {lost}")
+            lost = None
+        _raise_first(done, failed or lost)
 
     def _listen(self, channel: Channel) -> tuple[messages.Done, Exception | None]:
         """Hear what the worker says until it is done; return what could not be understood, too."""
@@ -317,14 +348,20 @@ class RemoteNode:
             except (EOFError, OSError):
                 raise
             except Exception as exc:  # a message's own class
-                failed = exc
+                failed = failed or exc
                 continue
             if isinstance(said, messages.Done):
                 return said, failed
-            self._hear(said, channel)
+            if isinstance(said, messages.Open | messages.Fetch):
+                self._answer(said, channel)
+                continue
+            try:
+                self._hear(said)
+            except Exception as exc:  # a filter of the application's log, say
+                failed = failed or exc
 
-    def _send(self, call: messages.Call, channel: Channel) -> Exception | None:
-        """Ask for a callback; return what is wrong with messages that cannot travel."""
+    def _send(self, call: messages.Call, channel: Channel) -> BaseException | None:
+        """Ask for a callback; return what is wrong with messages that are lost on the way."""
         try:
             channel.send(messages.to_plain(call))
         except (EOFError, OSError):
@@ -344,7 +381,7 @@ class RemoteNode:
             )
         return None
 
-    def _hear(self, said: Any, channel: Channel) -> None:
+    def _hear(self, said: Any) -> None:
         core = self._live.core
         match said:
             case messages.Sent(topic, message):
@@ -354,10 +391,31 @@ class RemoteNode:
                 logging.getLogger(record["name"]).handle(logging.makeLogRecord(dict(record)))
             case messages.Stop(reason):
                 self._live.control.request_stop(reason)
+
+    def _answer(self, question: messages.Open | messages.Fetch, channel: Channel) -> None:
+        """Answer with what was asked for, or with the reason why not."""
+        try:
+            answer = messages.Answer(None, self._find(question))
+        except Exception as exc:
+            answer = messages.Answer(pack_error(exc), None)
+        channel.send(tuple(answer))
+
+    def _find(self, question: messages.Open | messages.Fetch) -> bytes | None:
+        match question:
             case messages.Open(topic):
-                channel.send(core.open_input(topic, warn=False).topic.newest)
+                return self._pack_newest(self._live.core.open_input(topic, warn=False))
             case messages.Fetch(name):
-                channel.send(by_value(name))
+                return by_value(name)
+
+    def _pack_newest(self, subscription: Subscription) -> bytes | None:
+        """Return the newest message of a topic; None if there is none that can travel."""
+        topic = subscription.topic
+        try:
+            return None if topic.newest is None else dumps(topic.newest, None)
+        except Exception as exc:
+            text = f"the newest message on topic {topic.name!r} cannot go to its process: {exc}"
+            self._live.emit(logging.WARNING, text)
+            return None
 
     # -- topics --------------------------------------------------------------------------
 
@@ -369,15 +427,7 @@ class RemoteNode:
         }
         topics = [publisher.topic for publisher in live.core.outputs.values()]
         topics += [subscription.topic for subscription in subscriptions.values()]
-        newest, refused = part(
-            [
-                (name, (subscription.topic.newest,))
-                for name, subscription in subscriptions.items()
-                if subscription.topic.newest is not None
-            ]
-        )
-        for topic, _ in refused:
-            live.emit(logging.WARNING, f"the message on topic {topic!r} cannot go to its process")
+        newest = {name: self._pack_newest(each) for name, each in subscriptions.items()}
         loggers = ("", "horus", f"horus.node.{live.name}")
         return messages.Setup(
             levels={name: logging.getLogger(name).getEffectiveLevel() for name in loggers},
@@ -405,14 +455,17 @@ class RemoteNode:
 
 def _interpreter_options() -> list[str]:
     """Return options that make an interpreter treat assertions and warnings as this one does."""
-    options = ["-O"] * sys.flags.optimize + ["-B"] * sys.flags.dont_write_bytecode
+    # Not the working directory: what is called like a standard module there is not meant.
+    options = ["-P", *["-O"] * sys.flags.optimize, *["-B"] * sys.flags.dont_write_bytecode]
+    options += ["-I"] * sys.flags.isolated + ["-E"] * sys.flags.ignore_environment
+    options += ["-s"] * sys.flags.no_user_site
     options += [f"-W{option}" for option in sys.warnoptions]
     for name, value in sys._xoptions.items():
         options += ["-X", name if value is True else f"{name}={value}"]
     return options
 
 
-def _raise_first(done: messages.Done, failed: Exception | None) -> None:
+def _raise_first(done: messages.Done, failed: BaseException | None) -> None:
     """Raise what the callback has raised, or else what went wrong with its messages."""
     if done.error is not None:
         raise unpack_error(done.error)

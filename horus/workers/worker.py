@@ -31,7 +31,7 @@ from horus.stats import NodeCounters
 from horus.topics import Bus, Publisher, Subscription, Topic
 from horus.workers import messages
 from horus.workers.channel import Channel
-from horus.workers.pickling import Unpickler, dumps, pack_error
+from horus.workers.pickling import Unpickler, dumps, pack_error, unpack_error
 
 _NICENESS = 5
 """Behind the scheduler's own threads."""
@@ -46,6 +46,12 @@ def main(turns: int, aside: int, stacks: int) -> None:
         stacks: A file; at SIGUSR1 the stack of the main thread is written to it.
     """
     os_rt.die_with_parent()
+    for descriptor in (turns, aside, stacks):
+        if descriptor >= 0:
+            os.set_inheritable(descriptor, False)
+    # A service manager tells all processes of a service. The scheduler ends this one in order.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
     if stacks >= 0:
         import faulthandler
 
@@ -77,8 +83,8 @@ class Worker:
             self._bus.topic(topic).declare_type(kind)
         self._core.connect(self._bus)
         self._core.request_stop = lambda reason: self.say(messages.Stop(reason))
-        for topic, (newest,) in setup.newest:
-            self._bus.topic(topic).newest = newest
+        for topic, newest in setup.newest.items():
+            self._bus.topic(topic).newest = self._unpack_newest(topic, newest)
         self._bus.declared = True
         tick_rate_hz, wall_offset_ns = setup.timeline
         timeline = Timeline(MonotonicClock(), tick_rate_hz, wall_offset_ns=wall_offset_ns)
@@ -92,8 +98,9 @@ class Worker:
             raise EOFError("the scheduler is gone")
         sys.path[:] = place.path
         with contextlib.suppress(OSError):
-            os_rt.run_behind(_NICENESS)
-            if place.cores is not None:
+            os_rt.run_behind(os_rt.niceness() + _NICENESS)
+        if place.cores is not None:
+            with contextlib.suppress(OSError):
                 os_rt.run_on(place.cores)
 
     def serve(self) -> None:
@@ -105,7 +112,13 @@ class Worker:
             return
         threading.Thread(target=self._serve_aside, name="horus-aside", daemon=True).start()
         while True:
-            call = messages.from_plain(self._turns.receive())
+            try:
+                call = messages.from_plain(self._turns.receive())
+            except (EOFError, OSError):
+                raise
+            except Exception as exc:  # a message's own class
+                self.say(messages.Done(pack_error(exc), self._queues(), False))
+                continue
             self._deliver(call.inputs)
             self._tick_context.follow(call.moment)
             self.say(self._run(call.phase, self._context))
@@ -123,17 +136,21 @@ class Worker:
         channel: Channel = getattr(self._conversation, "channel", self._turns)
         channel.send(messages.to_plain(message))
 
-    def ask(self, question: Any) -> Any:
-        """Ask the scheduler something and wait for the answer.
+    def ask(self, question: Any) -> bytes | None:
+        """Ask the scheduler something, and return what it answers, pickled.
 
         Raises:
             StateError: Not in a callback: nobody would answer.
+            BaseException: Why it cannot be had.
         """
         channel: Channel | None = getattr(self._conversation, "channel", None)
         if channel is None:
             raise StateError("topics are opened in callbacks; declare them with subs= and pubs=")
         channel.send(messages.to_plain(question))
-        return channel.receive()
+        answer = messages.Answer(*channel.receive())
+        if answer.error is not None:
+            raise unpack_error(answer.error)
+        return answer.content
 
     def _channel(self, descriptor: int) -> Channel:
         def loads(body: memoryview, buffers: Iterable[memoryview]) -> Any:
@@ -142,7 +159,22 @@ class Worker:
         return Channel(socket.socket(fileno=descriptor), dumps, loads)
 
     def _fetch(self, name: str) -> Any:
-        return cloudpickle.loads(self.ask(messages.Fetch(name)))
+        return cloudpickle.loads(self.ask(messages.Fetch(name)) or b"")
+
+    def newest(self, topic: str) -> Frozen | None:
+        """Return the newest message on a topic of the scheduler's."""
+        return self._unpack_newest(topic, self.ask(messages.Open(topic)))
+
+    def _unpack_newest(self, topic: str, packed: bytes | None) -> Frozen | None:
+        if packed is None:
+            return None
+        try:
+            newest: Frozen = Unpickler(memoryview(packed), [], self._fetch).load()
+        except Exception as exc:
+            text = "the newest message on topic %r cannot be understood in its process: %r"
+            logging.getLogger(f"horus.node.{self._core.spec.name}").warning(text, topic, exc)
+            return None
+        return newest
 
     def _deliver(self, inputs: messages.Inputs) -> None:
         for topic, arrived in inputs:
@@ -163,12 +195,14 @@ class Worker:
                 raise TypeError(f"{phase}() returned a coroutine that nobody would await")
 
         error = _attempt(call)
-        queues = [
+        return messages.Done(error, self._queues())
+
+    def _queues(self) -> list[tuple[str, int, int]]:
+        return [
             (topic, subscription.received, len(subscription.queue))
-            for topic, subscription in self._core.inputs.items()
+            for topic, subscription in self._core.inputs.copy().items()
             if isinstance(topic, str)
         ]
-        return messages.Done(error, queues)
 
     def _listen(self, levels: Mapping[str, int]) -> None:
         logging.getLogger().addHandler(_Forwarder(self))
@@ -188,7 +222,7 @@ class _RemoteBus(Bus):
     def subscribe(self, name: Any, owner: str, capacity: int = 0) -> Subscription:
         subscription = super().subscribe(name, owner, *((capacity,) if capacity else ()))
         if self.declared:
-            subscription.topic.newest = self._worker.ask(messages.Open(subscription.topic.name))
+            subscription.topic.newest = self._worker.newest(subscription.topic.name)
         return subscription
 
     def make_topic(self, name: str) -> Topic:
@@ -238,12 +272,24 @@ class _Forwarder(logging.Handler):
         self._worker = worker
 
     def emit(self, record: logging.LogRecord) -> None:
-        fields = dict(record.__dict__)
-        fields.update(msg=record.getMessage(), args=None, exc_info=None)
-        if record.exc_info and not record.exc_text:
-            fields["exc_text"] = logging.Formatter().formatException(record.exc_info)
-        with contextlib.suppress(Exception):  # the scheduler is gone, or a field cannot travel
-            self._worker.say(messages.Logged(fields))
+        try:
+            fields = dict(record.__dict__)
+            fields.update(msg=record.getMessage(), args=None, exc_info=None)
+            if record.exc_info and not record.exc_text:
+                fields["exc_text"] = logging.Formatter().formatException(record.exc_info)
+            try:
+                self._worker.say(messages.Logged(fields))
+            except (EOFError, OSError):
+                pass  # the scheduler is gone
+            except Exception:  # something of `extra=` cannot travel
+                plain = {
+                    name: value
+                    for name, value in fields.items()
+                    if value is None or isinstance(value, str | int | float)
+                }
+                self._worker.say(messages.Logged(plain))
+        except Exception:
+            self.handleError(record)
 
 
 def _attempt(function: Callable[[], None]) -> bytes | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import itertools
 import logging
 import os
@@ -23,6 +24,7 @@ import pytest
 
 import horus
 from horus import Node, Pub, Scheduler, Sub, WorkerDied, WorkerError, ms
+from horus.workers.process import WorkerProcess
 
 from .helpers import nothing, run_program, run_until, running, wait_until
 
@@ -53,6 +55,56 @@ def add_sink(sched: Scheduler, *topics: str) -> Messages:
     subs = [Sub(topic, capacity=10_000) for topic in topics]
     sched.add(Node("sink", collect, rate=200, order=999, subs=subs))
     return collected
+
+
+class Homesick:
+    """Is pickled, and not unpickled in any other process."""
+
+    def __deepcopy__(self, memo):
+        return self
+
+    def __reduce__(self):
+        return _only_in, (os.getpid(),)
+
+
+def _only_in(process):
+    if os.getpid() != process:
+        raise ValueError("not here")
+    return Homesick()
+
+
+class Stubborn:
+    """Is not even pickled."""
+
+    def __deepcopy__(self, memo):
+        return self
+
+    def __reduce__(self):
+        raise TypeError("not me")
+
+
+class Slow:
+    """Takes its time to be pickled."""
+
+    begun, go_on = threading.Event(), threading.Event()
+
+    def __reduce__(self):
+        self.begun.set()
+        self.go_on.wait(20)
+        return Slow, ()
+
+
+CHILD_LIVES_S = 20.0
+
+
+def _keep_by_fork():
+    if os.fork() == 0:
+        time.sleep(CHILD_LIVES_S)
+        os._exit(0)
+
+
+def _keep_by_shell():
+    os.system(f"sleep {CHILD_LIVES_S} >/dev/null 2>&1 &")
 
 
 def stats(sched: Scheduler, name: str = "worker") -> dict[str, Any]:
@@ -726,13 +778,6 @@ def test_an_input_that_cannot_travel_is_named_and_the_others_arrive(make):
     sched = make()
     errors = []
 
-    class Stubborn:
-        def __deepcopy__(self, memo):
-            return self
-
-        def __reduce__(self):
-            raise TypeError("not me")
-
     out = add_sink(sched, "out")
 
     def tick(node):
@@ -749,6 +794,187 @@ def test_an_input_that_cannot_travel_is_named_and_the_others_arrive(make):
     assert isinstance(errors[0], WorkerError)
     assert "Stubborn" in str(errors[0])
     assert stats(sched)["dropped"] == 1
+
+
+@pytest.mark.parametrize("message", [Homesick(), Stubborn()], ids=lambda each: type(each).__name__)
+def test_a_newest_message_that_cannot_travel_does_not_keep_a_worker_from_its_start(
+    make, message, caplog
+):
+    """The node starts without it, and says so; an undeclared topic has none then."""
+    sched = make()
+    out = add_sink(sched, "out")
+
+    def tick(node):
+        node.send("out", (node.latest("in"), node.recv("undeclared"), horus.tick()))
+
+    sched.add(worker("worker", tick, subs=["in"], pubs=["out"]))
+    for topic in ("in", "undeclared"):
+        sched.publish(topic, message)
+    run_until(sched, lambda: len(out) >= 3)
+    assert {row[:2] for row in out} == {(None, None)}
+    # Questions and answers have not come out of step.
+    numbers = [row[2] for row in out]
+    assert numbers == sorted(set(numbers))
+    assert "topic 'in' cannot" in caplog.text
+
+
+def test_an_input_that_cannot_be_unpickled_fails_the_tick_and_nothing_else(make):
+    """The worker goes on with the next call."""
+    sched = make()
+    errors = []
+    out = add_sink(sched, "out")
+
+    def tick(node):
+        for message in node.recv_all("in"):
+            node.send("out", (message, os.getpid()))
+
+    sched.add(
+        worker(
+            "worker", tick, subs=["in"], pubs=["out"], on_error=lambda n, exc: errors.append(exc)
+        )
+    )
+    with running(sched):
+        wait_until(lambda: stats(sched)["total_ticks"] > 0)
+        sched.publish("in", "before")
+        wait_until(lambda: len(out) == 1)
+        sched.publish("in", Homesick())
+        wait_until(lambda: errors)
+        sched.publish("in", "after")
+        wait_until(lambda: len(out) == 2)
+    assert [message for message, _ in out] == ["before", "after"]
+    assert len({process for _, process in out}) == 1
+    assert "not here" in str(errors[0])
+
+
+def test_what_the_log_of_the_application_does_with_a_record_is_that_tick_s_error(make, caplog):
+    """Messages of later ticks are still those of later ticks."""
+    sched = make()
+    errors = []
+    out = add_sink(sched, "out")
+
+    def refuse(record):
+        if record.getMessage() == "bad":
+            raise ZeroDivisionError
+        return True
+
+    ticks = itertools.count()
+
+    def tick(node):
+        number = next(ticks)
+        if number % 5 == 4:
+            node.log_warning("bad")
+        node.send("out", number)
+
+    sched.add(worker("worker", tick, pubs=["out"], on_error=lambda n, exc: errors.append(exc)))
+    logger = logging.getLogger("horus.node.worker")
+    logger.addFilter(refuse)
+    try:
+        run_until(sched, lambda: len(errors) >= 2 and len(out) > 12)
+    finally:
+        logger.removeFilter(refuse)
+    assert {type(exc) for exc in errors} == {ZeroDivisionError}
+    assert out == list(range(len(out)))
+    assert len(errors) == len(out) // 5
+
+
+def test_a_log_call_that_is_malformed_fails_no_tick(make, capfd):
+    """As on a thread: it is told on stderr. What cannot travel of a record stays behind."""
+    sched = make()
+    errors = []
+    out = add_sink(sched, "out")
+    heard = []
+
+    class Listener(logging.Handler):
+        def emit(self, record):
+            heard.append(record)
+
+    def tick(node):
+        logger = logging.getLogger("horus.driver")
+        logger.error("%d", "x")
+        logger.error("told", extra={"lock": threading.Lock(), "axle": 3})
+        node.send("out", 1)
+
+    sched.add(worker("worker", tick, pubs=["out"], on_error=lambda n, exc: errors.append(exc)))
+    listener = Listener()
+    logging.getLogger("horus.driver").addHandler(listener)
+    try:
+        run_until(sched, lambda: len(out) >= 3)
+    finally:
+        logging.getLogger("horus.driver").removeHandler(listener)
+    assert not errors
+    assert "Logging error" in capfd.readouterr().err
+    assert {(record.getMessage(), record.axle) for record in heard} == {("told", 3)}
+
+
+@pytest.mark.parametrize("keep", [_keep_by_fork, _keep_by_shell])
+def test_a_crash_is_noticed_though_a_child_of_the_worker_lives(make, keep):
+    """It holds the worker's sockets open."""
+    sched = make()
+    out = add_sink(sched, "out")
+    ticks = itertools.count()
+
+    def tick(node):
+        node.send("out", os.getpid())
+        if next(ticks) == 3:
+            keep()
+            os._exit(1)
+
+    sched.add(worker("worker", tick, pubs=["out"], failure_policy="restart"))
+    began = time.monotonic()
+    run_until(sched, lambda: len(set(out)) >= 2)
+    assert time.monotonic() - began < CHILD_LIVES_S / 2
+
+
+def test_a_service_that_is_told_to_end_is_told_as_a_whole_and_workers_end_in_order(make):
+    """A service manager sends SIGTERM to every process: `shutdown()` runs nevertheless."""
+    sched = make()
+    out = add_sink(sched, "out")
+    sched.add(
+        worker(
+            "worker",
+            lambda node: node.send("out", os.getpid()),
+            shutdown=lambda node: node.send("out", "shutdown"),
+            pubs=["out"],
+        )
+    )
+    last = sched.subscribe("out", capacity=100_000)
+    with running(sched):
+        wait_until(lambda: out)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            os.kill(out[0], number)
+        count = len(out)
+        wait_until(lambda: len(out) > count + 3)
+    assert len(set(out) - {"shutdown"}) == 1
+    assert last.recv_all()[-1] == "shutdown"
+
+
+def test_a_worker_that_cannot_be_started_leaves_no_descriptor(make, monkeypatch, caplog):
+    """The node is excluded, and the reason told."""
+    before = len(os.listdir("/proc/self/fd"))
+
+    def refuse(*args):
+        raise OSError(errno.EMFILE, "too many open files")
+
+    monkeypatch.setattr(socket, "socketpair", refuse)
+    with pytest.raises(WorkerError, match="no worker process can be had"):
+        WorkerProcess("worker", nothing)
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_node_that_is_left_behind_while_its_worker_starts_gets_none(make, caplog):
+    """A run that has ended starts no process any more."""
+    sched = make(shutdown_timeout=0.2)
+    slow = Slow()
+    sched.add(worker("worker", lambda node: slow))
+    thread = threading.Thread(target=lambda: sched.run(duration=20), daemon=True)
+    thread.start()
+    assert Slow.begun.wait(20)
+    sched.stop()
+    thread.join(20)
+    assert not thread.is_alive()
+    Slow.go_on.set()
+    wait_until(lambda: "dismissed" in caplog.text)
+    wait_until(lambda: all(each.name != "horus-worker:worker" for each in threading.enumerate()))
 
 
 # -- a parent that goes, and long runs ------------------------------------------------------
