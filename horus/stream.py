@@ -15,8 +15,8 @@ from horus.topics import Subscription
 class MessageStream:
     """The messages of a topic, oldest first, for code that is not a node.
 
-    Use it as `async for message in stream`, or ask with `recv()` and
-    `recv_all()`. The iteration ends when the scheduler's run ends or `close()`
+    Use it as `async for message in stream`, or ask with `recv()`, `recv_all()`
+    and `latest()`. The iteration ends when the scheduler's run ends or `close()`
     is called, after the messages that still wait.
 
     Thread: any one thread, and any event loop; messages may come from all threads.
@@ -50,6 +50,10 @@ class MessageStream:
     def recv_all(self) -> list[Any]:
         """Return all messages that wait, oldest first."""
         return self._subscription.take_all()
+
+    def latest(self) -> Any:
+        """Return the topic's newest message, received or not; None before the first."""
+        return self._subscription.topic.latest()
 
     def close(self) -> None:
         """Receive nothing more; an iteration ends after what still waits."""

@@ -233,6 +233,7 @@ class Topic:
         self._lock = lock
         self._accepted: tuple[type, ...] = (object,)
         self._sent_by_retired = 0
+        self._dropped_by_retired = 0
 
     @property
     def sent(self) -> int:
@@ -302,14 +303,18 @@ class Topic:
     def unsubscribe(self, subscription: Subscription) -> None:
         """Take a subscription away; unknown ones are ignored."""
         with self._lock:
-            self.subscriptions = tuple(s for s in self.subscriptions if s is not subscription)
+            kept = tuple(s for s in self.subscriptions if s is not subscription)
+            if len(kept) < len(self.subscriptions):
+                self._dropped_by_retired += subscription.dropped
+            self.subscriptions = kept
 
     def statistics(self) -> TopicStatistics:
         """Return the counters."""
         return TopicStatistics(
             topic=self.name,
             sent=self.sent,
-            dropped=sum(subscription.dropped for subscription in self.subscriptions),
+            dropped=self._dropped_by_retired
+            + sum(subscription.dropped for subscription in self.subscriptions),
             publishers=tuple(publisher.owner for publisher in self.publishers),
             subscribers=tuple(subscription.owner for subscription in self.subscriptions),
         )

@@ -100,7 +100,12 @@ class RecordingReader:
             RecordingError: It cannot be opened, or is no finished recording.
         """
         self.path = Path(path)
-        if sessions.state_of(self.path) != "finished":
+        state = sessions.state_of(self.path)
+        if state == "recording":
+            raise RecordingError(f"{self.path} is being recorded; stop that first")
+        if state != "finished":
+            if not self.path.exists():
+                raise RecordingError(f"there is no file {self.path}")
             raise RecordingError(
                 f"{self.path} is unfinished or truncated: horus.recover(path) salvages it"
             )

@@ -73,7 +73,7 @@ def open_recording(path: str | os.PathLike[str]) -> RecordingReader:
     Raises:
         RecordingError: It is no recording, it is being recorded, or it cannot be recovered.
     """
-    if sessions.state_of(Path(path)) == "unfinished":
+    if Path(path).exists() and sessions.state_of(Path(path)) == "unfinished":
         _log.warning("recovered %s", recover(path))
     return RecordingReader(path)
 

@@ -354,3 +354,29 @@ def test_in_virtual_time_beside_the_application(make, loop):
             await sched.wait_node("motor", ticks=1000)
 
     run_async(main(), loop)
+
+
+def test_the_newest_message_of_a_stream_can_be_asked_for_again(make):
+    """It stays, received or not, for the next request of a web server."""
+    sched = make()
+    stream = sched.subscribe("pose", capacity=2)
+    assert stream.latest() is None
+    for message in ([1], [2], [3]):
+        sched.publish("pose", message)
+    stream.latest().append("mine alone")
+    assert [stream.latest(), stream.recv(), stream.recv(), stream.recv()] == [[3], [2], [3], None]
+    assert stream.latest() == [3]
+    stream.close()
+
+
+def test_what_a_stream_has_dropped_is_counted_when_it_is_gone(make):
+    """A counter that fell would look like a restart."""
+    sched = make()
+    stream = sched.subscribe("pose", capacity=1)
+    for number in range(5):
+        sched.publish("pose", number)
+    lines = [line for line in sched.metrics_text().splitlines() if "topic_dropped_total{" in line]
+    assert [line.split()[-1] for line in lines] == ["4.0"]
+    stream.close()
+    stream.close()
+    assert all(line in sched.metrics_text().splitlines() for line in lines)

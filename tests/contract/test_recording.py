@@ -520,3 +520,19 @@ def test_a_program_that_ends_without_ending_its_session_leaves_a_finished_file(t
     (session,) = Scheduler(recording=tmp_path).list_recordings()
     assert session.finished
     assert read(session.path) == [1]
+
+
+def test_a_recording_that_is_not_there_or_not_finished_is_called_so(tmp_path):
+    """Nobody is told to recover what is missing, or still written."""
+    with pytest.raises(RecordingError, match="there is no file"):
+        horus.open_recording(tmp_path / "session.mcap")
+    with pytest.raises(RecordingError, match="there is no file"):
+        RecordingReader(tmp_path / "session.mcap")
+    sched = Scheduler(recording=tmp_path, deterministic=True)
+    sched.add(Node("node", nothing))
+    sched.tick_once()
+    (path,) = tmp_path.glob("*.mcap")
+    for open_it in (horus.open_recording, RecordingReader):
+        with pytest.raises(RecordingError, match="is being recorded"):
+            open_it(path)
+    sched.stop()

@@ -15,6 +15,8 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "fault_drill.py"
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 TIMEOUT_S = 60
 
+pytestmark = pytest.mark.realtime
+
 
 def _run(*arguments: str, cwd: Path, typed: str = "") -> subprocess.CompletedProcess[str]:
     """Run the example as a user would."""
@@ -123,12 +125,13 @@ def test_faults_can_be_ordered_by_hand(tmp_path: Path) -> None:
         "CRITICAL +safe state entered: critical node motor",
         "refused +the safe state stays: motor is critical",
         "its frozen tick has ended",
-        "safe state cleared",
         "tick +ticks again",
         "motor +running +healthy",
         "safe state: no",
     )
     assert re.search(".*".join(happened), done.stdout, re.DOTALL), done.stdout
+    # By the thread that clears it, which the motor's need not wait for.
+    assert "safe state cleared" in done.stdout
 
 
 def test_unknown_commands_are_explained(tmp_path: Path) -> None:
