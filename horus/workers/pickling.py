@@ -8,12 +8,13 @@ asked for (`Unpickler.fetch`) if it is not there yet; so it is the same class in
 
 from __future__ import annotations
 
+import functools
 import io
 import pickle
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Mapping
-from types import FunctionType
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from types import CodeType, FunctionType, MethodType
 from typing import Any
 
 import cloudpickle
@@ -22,6 +23,9 @@ from horus.core import NodeCore
 from horus.errors import WorkerError
 from horus.snapshot import Frozen
 from horus.workers.messages import Inputs
+
+_DEEPEST = 8
+"""So many steps are followed to what cannot be pickled."""
 
 BufferCallback = Callable[[pickle.PickleBuffer], None] | None
 
@@ -144,30 +148,68 @@ def unpack_error(packed: bytes) -> BaseException:
 def _culprit(core: NodeCore) -> str | None:
     """Return what cannot be pickled, in words, if it can be found."""
     for phase, function in core.functions.items():
-        function = getattr(function, "__func__", function)
-        if not isinstance(function, FunctionType) or _travels(function):
-            continue
-        for name, value in _used_by(function).items():
-            if not _travels(value):
-                return _refusal(f"{phase}() uses {name!r}", value)
+        # A method of the node leads to the node, whose attributes come last.
+        plain = getattr(function, "__func__", function)
+        if not _travels(plain) and (found := _inmost(plain)) is not None:
+            return _refusal(f"{phase}()", *found)
     for name, value in getattr(core.node, "__dict__", {}).items():
         if not name.startswith("_horus") and not _travels(value):
-            return _refusal(f"its attribute {name!r} is", value)
+            steps, inmost = _inmost(value) or ([], value)
+            return _refusal("it", [f"has .{name}", *steps], inmost)
     return None
 
 
-def _refusal(what: str, value: object) -> str:
-    kind = type(value)
+def _inmost(value: object) -> tuple[list[str], object] | None:
+    """Return the way to what does not travel in something, and that; None if it is not found."""
+    steps: list[str] = []
+    while len(steps) < _DEEPEST:
+        for step, part_of_it in _parts(value):
+            if not _travels(part_of_it):
+                steps.append(step)
+                value = part_of_it
+                break
+        else:
+            break
+    return (steps, value) if steps else None
+
+
+def _refusal(subject: str, steps: list[str], value: object) -> str:
+    way, kind = ", which ".join(steps), type(value)
     return (
-        f"{what}, a {kind.__module__}.{kind.__qualname__}, which cannot go to a worker process; "
-        "make it in init(), which runs there, or keep the node on a thread with compute=True"
+        f"{subject} {way}, a {kind.__module__}.{kind.__qualname__}, which cannot go to a worker "
+        "process; make it in init(), which runs there, or keep the node on a thread with compute=True"
     )
 
 
+def _parts(value: object) -> Iterator[tuple[str, object]]:
+    """Yield what something leads to when it is pickled, with words for the step."""
+    if isinstance(value, FunctionType):
+        for name, used in _used_by(value).items():
+            yield f"uses {name!r}", used
+    elif isinstance(value, functools.partial):
+        yield "calls a function", value.func
+        for place, argument in enumerate(value.args):
+            yield f"has argument {place}", argument
+        for name, argument in value.keywords.items():
+            yield f"has argument {name!r}", argument
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            yield f"has [{key!r}]", item
+    elif isinstance(value, list | tuple | set | frozenset):
+        for place, item in enumerate(value):
+            yield f"has [{place}]", item
+    elif isinstance(value, MethodType):
+        yield "belongs to an object", value.__self__
+    else:
+        for name, attribute in getattr(value, "__dict__", {}).items():
+            yield f"has .{name}", attribute
+
+
 def _used_by(function: FunctionType) -> Mapping[str, Any]:
+    """Return what a function refers to by name: globals, closure and defaults."""
     used = {
         name: function.__globals__[name]
-        for name in function.__code__.co_names
+        for name in _names_in(function.__code__)
         if name in function.__globals__
     }
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
@@ -175,7 +217,20 @@ def _used_by(function: FunctionType) -> Mapping[str, Any]:
             used[name] = cell.cell_contents
         except ValueError:
             continue  # not assigned yet
+    defaults = function.__defaults__ or ()
+    code = function.__code__
+    names = code.co_varnames[: code.co_argcount]
+    used.update(zip(names[len(names) - len(defaults) :], defaults, strict=True))
+    used.update(function.__kwdefaults__ or {})
     return used
+
+
+def _names_in(code: CodeType) -> Iterator[str]:
+    """Yield the names of globals in code and in the functions and comprehensions in it."""
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names_in(constant)
 
 
 def _travels(value: object) -> bool:

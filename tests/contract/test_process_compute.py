@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import functools
 import itertools
 import logging
 import os
@@ -741,19 +742,71 @@ def test_it_runs_inline_in_steps_and_in_virtual_time(make, mode):
 # -- what cannot travel --------------------------------------------------------------------
 
 
-def test_a_closure_that_cannot_travel_is_named(make, caplog):
-    """With what to do about it."""
+class Device:
+    """Holds what cannot be pickled, deeper down."""
+
+    def __init__(self):
+        self.ports = {"left": [threading.Lock()]}
+
+
+def _by_closure():
+    lock = threading.Lock()
+    return Node("worker", lambda: lock, compute="process")
+
+
+def _by_comprehension():
+    locks = [threading.Lock()]
+    return Node("worker", lambda: [lock for lock in locks for _ in locks], compute="process")
+
+
+def _by_nested_function():
     lock = threading.Lock()
 
-    def tick(node):
-        with lock:
+    def tick():
+        return (lambda: lock)()
+
+    return Node("worker", tick, compute="process")
+
+
+def _by_default():
+    return Node("worker", lambda node, lock=threading.Lock(): lock, compute="process")  # noqa: B008
+
+
+def _by_partial():
+    return Node("worker", functools.partial(print, threading.Lock()), compute="process")
+
+
+def _by_attribute():
+    class Robot(Node):
+        def tick(self):
             pass
 
+    robot = Robot("worker", compute="process")
+    robot.device = Device()
+    return robot
+
+
+@pytest.mark.parametrize(
+    ("make_node", "named"),
+    [
+        (_by_closure, "tick() uses 'lock', a _thread.lock,"),
+        (_by_comprehension, "tick() uses 'locks', which has [0], a _thread.lock,"),
+        (_by_nested_function, "tick() uses 'lock', a _thread.lock,"),
+        (_by_default, "tick() uses 'lock', a _thread.lock,"),
+        (_by_partial, "tick() has argument 0, a _thread.lock,"),
+        (
+            _by_attribute,
+            "it has .device, which has .ports, which has ['left'], which has [0], a _thread.lock,",
+        ),
+    ],
+)
+def test_what_cannot_travel_is_named(make, caplog, make_node, named):
+    """With the way to it, and what to do about it; nobody else is kept from running."""
     sched = make()
-    sched.add(worker("worker", tick))
+    sched.add(make_node())
     sched.add(Node("other", nothing, rate=50))
     run_until(sched, lambda: stats(sched, "other")["total_ticks"] > 3)
-    assert "tick() uses 'lock', a _thread.lock" in caplog.text
+    assert named in caplog.text
     assert "make it in init()" in caplog.text
 
 
