@@ -177,7 +177,8 @@ def _refusal(subject: str, steps: list[str], value: object) -> str:
     way, kind = ", which ".join(steps), type(value)
     return (
         f"{subject} {way}, a {kind.__module__}.{kind.__qualname__}, which cannot go to a worker "
-        "process; make it in init(), which runs there, or keep the node on a thread with compute=True"
+        "process; make it in init(), which runs there, or keep the node on a thread with "
+        "compute=True"
     )
 
 
