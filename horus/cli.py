@@ -158,6 +158,8 @@ def _log(options: argparse.Namespace) -> int:
     with recovery.open_recording(options.recording) as reader:
         began_ns = reader.about["log_ns"]
         for entry in reader.entries():
+            # A flight recorder writes the configuration again and again, the last time here.
+            began_ns = min(began_ns, entry.log_ns)
             topic = entry.channel.topic
             if topic == "horus/log":
                 said = reader.json_of(entry.data, topic)
