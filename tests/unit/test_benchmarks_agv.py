@@ -552,7 +552,6 @@ def test_a_frozen_node_is_reacted_to_while_it_is_frozen(monkeypatch: pytest.Monk
     assert reaction_ns >= 0.5 * scenario.CRITICAL_TIMEOUT_MS * MS
 
 
-@pytest.mark.realtime
 @pytest.mark.parametrize("mode", ["thread", "process"])
 def test_a_short_drive_of_this_package_yields_every_figure(mode: str) -> None:
     """Samples come from this checkout; the planner computes meanwhile."""

@@ -200,7 +200,6 @@ def test_a_lost_message_is_missed(module: Any, tmp_path: Path) -> None:
 # -- one cheap run ----------------------------------------------------------------------
 
 
-@pytest.mark.realtime
 @pytest.mark.parametrize("workload", recording.BENCHMARK.workloads)
 def test_a_quick_run_of_this_package_yields_every_figure(workload: str) -> None:
     """Samples come from this checkout and reduce to finite numbers."""
@@ -214,7 +213,6 @@ def test_a_quick_run_of_this_package_yields_every_figure(workload: str) -> None:
     assert "failed" not in text
 
 
-@pytest.mark.realtime
 def test_the_bare_writer_writes_the_same_messages() -> None:
     """A peer that is measured with other messages is no peer."""
     bare = lasting(recording.bare_writer(), 0.3)

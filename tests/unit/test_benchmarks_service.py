@@ -68,7 +68,6 @@ def test_messages_of_a_round_trip_can_be_told_apart() -> None:
         assert numbers == list(range(service_workloads.NUMBERS))
 
 
-@pytest.mark.realtime
 @pytest.mark.parametrize("workload", service.BENCHMARK.workloads)
 def test_a_quick_run_of_this_package_yields_every_figure(workload: str) -> None:
     """Samples come from this checkout and reduce to finite numbers."""
@@ -81,7 +80,6 @@ def test_a_quick_run_of_this_package_yields_every_figure(workload: str) -> None:
     assert "failed" not in text
 
 
-@pytest.mark.realtime
 def test_the_process_pool_answers_the_same_questions() -> None:
     """A peer that is measured with other messages is no peer."""
     _, pool = service.contenders(with_peers=True)
